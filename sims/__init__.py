@@ -1,0 +1,94 @@
+"""Simulations to render: bowling, falling, statues; `python -m sims.bowling` simulates and renders one.
+
+Each of the three modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]` and
+`lights()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the geoms that do are in
+group 3, which is not drawn.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from sims.surfaces import Body
+
+# Collision geoms are in this group, which MuJoCo does not draw by default.
+HIDDEN_GROUP = 3
+# Seconds: two steps are the shortest time constant that MuJoCo's contacts keep stable.
+TIMESTEP = 0.001
+
+
+def new_stage(position: tuple[float, float, float], target: tuple[float, float, float], fovy: float) -> mujoco.MjSpec:
+    """An empty model with a camera "front" at `position` (metres) that looks at `target`; fovy in degrees."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = TIMESTEP
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # Lit by environment and area lights: a lamp at the camera would flatten the shapes.
+    spec.visual.headlight.active = 0
+    back = np.subtract(position, target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    up = np.cross(back, right)
+    rotation = np.stack([axis / np.linalg.norm(axis) for axis in (right, up, back)], axis=1)
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    spec.worldbody.add_camera(name="front", pos=position, quat=quaternion, fovy=fovy)
+    return spec
+
+
+def add_material(spec: mujoco.MjSpec, name: str, rgb: tuple[float, float, float], gloss: float = 0.0) -> None:
+    """A material of sRGB colour `rgb`; `gloss` in [0, 1] raises the strength and the sharpness of its highlight."""
+    spec.add_material(name=name, rgba=[*rgb, 1.0], specular=gloss, shininess=gloss)
+
+
+def add_mesh(spec: mujoco.MjSpec, name: str, surface: Body) -> None:
+    """Makes a body of `sims.bodies` known to the model."""
+    vertices, faces = surface
+    spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
+
+
+def draw_mesh(body: mujoco.MjsBody, mesh: str, material: str) -> None:
+    """Draws a mesh of the model in the body's frame."""
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, material=material, contype=0, conaffinity=0, mass=0, group=0
+    )
+
+
+def draw_box(body: mujoco.MjsBody, name: str, low: tuple, high: tuple, material: str) -> None:
+    """Draws the box between two corners of the body's frame, metres."""
+    position, size = np.add(high, low) / 2, np.subtract(high, low) / 2
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=position,
+        size=size,
+        material=material,
+        contype=0,
+        conaffinity=0,
+        mass=0,
+        group=0,
+    )
+
+
+def step_frames(
+    model: mujoco.MjModel, data: mujoco.MjData, frames_per_second: float, duration: float = math.inf
+) -> Iterator[mujoco.MjData]:
+    """Yields `data` at the time of each frame, stepping it in between: always the same object, frame 0 unstepped."""
+    steps = 0
+    for frame in frame_numbers(frames_per_second, duration):
+        target = round(frame / frames_per_second / model.opt.timestep)
+        for _ in range(target - steps):
+            mujoco.mj_step(model, data)
+        steps = target
+        # A step leaves the poses of bodies and geoms one step behind the joints.
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        yield data
+
+
+def frame_numbers(frames_per_second: float, duration: float) -> Iterator[int]:
+    """0, 1, 2, ... for `duration` seconds, without end where that is infinite."""
+    return itertools.count() if math.isinf(duration) else iter(range(round(duration * frames_per_second)))

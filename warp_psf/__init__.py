@@ -1,0 +1,57 @@
+"""Soft shadows for MuJoCo simulations, frame after frame, by precomputed shadow fields on Warp kernels."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from warp_psf.bake import BakedBody, bake_mesh
+    from warp_psf.film.display import to_display
+    from warp_psf.film.sequence import FrameSequence
+    from warp_psf.film.writer import image_difference, read_exr
+    from warp_psf.renderer import Renderer
+    from warp_psf.scene.environment import Environment, load_environment
+    from warp_psf.scene.light import AreaLight, DeltaLight, rectangle_light
+    from warp_psf.scene.mesh import Mesh, load_mesh, make_mesh
+
+__all__ = [
+    "AreaLight",
+    "BakedBody",
+    "DeltaLight",
+    "Environment",
+    "FrameSequence",
+    "Mesh",
+    "Renderer",
+    "bake_mesh",
+    "image_difference",
+    "load_environment",
+    "load_mesh",
+    "make_mesh",
+    "read_exr",
+    "rectangle_light",
+    "to_display",
+]
+
+# The public names come on first use: `warp-psf --help` need not wait for Warp and MuJoCo.
+_HOMES = {
+    "AreaLight": "scene.light",
+    "BakedBody": "bake",
+    "DeltaLight": "scene.light",
+    "Environment": "scene.environment",
+    "FrameSequence": "film.sequence",
+    "Mesh": "scene.mesh",
+    "Renderer": "renderer",
+    "bake_mesh": "bake",
+    "image_difference": "film.writer",
+    "load_environment": "scene.environment",
+    "load_mesh": "scene.mesh",
+    "make_mesh": "scene.mesh",
+    "read_exr": "film.writer",
+    "rectangle_light": "scene.light",
+    "to_display": "film.display",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'warp_psf' has no attribute {name!r}")
+    return getattr(import_module(f"warp_psf.{_HOMES[name]}"), name)

@@ -1,0 +1,261 @@
+"""Ray-cast coverage: which part of the sphere of directions a body hides from a point, projected on SH.
+
+Rays are uniform in solid angle inside the cone of the body's bounding sphere, because no other ray can hit. Far from
+the body the paper's 64 x 64 directions over the whole sphere would leave a couple of dozen rays on it; the cone keeps
+hundreds there (`benchmarks/directions.py` compares them).
+"""
+
+import math
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis import sh, sphere
+from warp_psf.device import launch
+
+# Rays per sample. Inside the bounding sphere they cover all directions; outside, only the cone of the bounding sphere.
+RAYS_INSIDE = 1536
+RAYS_NEAR = 768
+RAYS_FAR = 384
+# Beyond this many bounding radii the cone is below 8 % of the sphere, and half the rays leave the same error.
+FAR_RADII = 2.0
+# Rays that decide whether a point is inside the solid: by the share of back faces among their first hits.
+RAYS_INSIDE_TEST = 48
+# How far a ray's origin leaves the surface, in bounding radii: enough for float32, too little to be seen.
+SURFACE_OFFSET = 1.0e-4
+# Layers of surface that a walk out of the solid crosses before it gives up.
+MOST_LAYERS = 16
+# A vector is rotated through its values at a quadrature's directions: exact for twice the highest degree.
+ROTATION_POINTS = {2: 16, 3: 16, 4: 32, 5: 64, 6: 64}
+
+
+@cache
+def make_visibility(order: int) -> SimpleNamespace:
+    """Kernels that cast rays and project what they hit on `order` SH bands."""
+    kit = sh.make_sh(order)
+    vec = kit.vec
+
+    @wp.func
+    def turn(
+        local: vec,
+        frame: wp.mat33,
+        directions: wp.array(dtype=wp.vec3),
+        weighted_basis: wp.array(dtype=vec),
+    ) -> vec:
+        """Coefficients about the axes of `frame` -> about the body's axes, by evaluating and projecting again."""
+        turned = vec()
+        to_local = wp.transpose(frame)
+        for q in range(directions.shape[0]):
+            turned += wp.dot(local, kit.evaluate(to_local * directions[q])) * weighted_basis[q]
+        return turned
+
+    @wp.kernel(module="unique")
+    def project_coverage(
+        first: int,
+        mesh: wp.uint64,
+        points: wp.array(dtype=wp.vec3),  # (sample)
+        axes: wp.array(dtype=wp.vec3),  # (sample): axis of the cone of rays
+        reach: float,
+        rays: wp.array(dtype=wp.vec3),  # (ray), about +z
+        weighted_basis: wp.array(dtype=vec),  # (ray): basis times solid angle of the ray
+        directions: wp.array(dtype=wp.vec3),  # (quadrature)
+        direction_basis: wp.array(dtype=vec),  # (quadrature)
+        coverage_out: wp.array(dtype=vec),  # (sample)
+    ):
+        world, sample = wp.tid()
+        sample += first
+        frame = sphere.frame_of(axes[sample])
+        covered = vec()
+        for ray in range(rays.shape[0]):
+            if wp.mesh_query_ray_anyhit(mesh, points[sample], frame * rays[ray], reach):
+                covered += weighted_basis[ray]
+        coverage_out[sample] = turn(covered, frame, directions, direction_basis)
+
+    @wp.kernel(module="unique")
+    def project_radiance(
+        first: int,
+        mesh: wp.uint64,
+        face_radiance: wp.array(dtype=wp.float32),  # (face): leaving the front of the face
+        points: wp.array(dtype=wp.vec3),  # (sample)
+        axes: wp.array(dtype=wp.vec3),  # (sample)
+        reach: float,
+        rays: wp.array(dtype=wp.vec3),  # (ray)
+        weighted_basis: wp.array(dtype=vec),  # (ray)
+        directions: wp.array(dtype=wp.vec3),  # (quadrature)
+        direction_basis: wp.array(dtype=vec),  # (quadrature)
+        radiance_out: wp.array(dtype=vec),  # (sample)
+    ):
+        world, sample = wp.tid()
+        sample += first
+        frame = sphere.frame_of(axes[sample])
+        gathered = vec()
+        for ray in range(rays.shape[0]):
+            hit = wp.mesh_query_ray(mesh, points[sample], frame * rays[ray], reach)
+            if hit.result and hit.sign > 0.0:
+                gathered += face_radiance[hit.face] * weighted_basis[ray]
+        radiance_out[sample] = turn(gathered, frame, directions, direction_basis)
+
+    @wp.kernel(module="unique")
+    def project_blocked_hemisphere(
+        first: int,
+        mesh: wp.uint64,
+        points: wp.array(dtype=wp.vec3),  # (vertex)
+        normals: wp.array(dtype=wp.vec3),  # (vertex)
+        reach: float,
+        rays: wp.array(dtype=wp.vec3),  # (ray), the hemisphere about +z
+        weighted_basis: wp.array(dtype=vec),  # (ray)
+        directions: wp.array(dtype=wp.vec3),  # (quadrature)
+        direction_basis: wp.array(dtype=vec),  # (quadrature)
+        blocked_out: wp.array(dtype=vec),  # (vertex)
+        blocked_cosine_out: wp.array(dtype=vec),  # (vertex)
+    ):
+        world, vertex = wp.tid()
+        vertex += first
+        frame = sphere.frame_of(normals[vertex])
+        blocked = vec()
+        blocked_cosine = vec()
+        for ray in range(rays.shape[0]):
+            if wp.mesh_query_ray_anyhit(mesh, points[vertex], frame * rays[ray], reach):
+                blocked += weighted_basis[ray]
+                blocked_cosine += rays[ray][2] * weighted_basis[ray]
+        blocked_out[vertex] = turn(blocked, frame, directions, direction_basis)
+        blocked_cosine_out[vertex] = turn(blocked_cosine, frame, directions, direction_basis)
+
+    return SimpleNamespace(
+        vec=vec,
+        project_coverage=project_coverage,
+        project_radiance=project_radiance,
+        project_blocked_hemisphere=project_blocked_hemisphere,
+    )
+
+
+@wp.kernel(module="unique")
+def _leave_solid(
+    first: int,
+    mesh: wp.uint64,
+    center: wp.vec3,
+    reach: float,
+    nudge: float,
+    rays: wp.array(dtype=wp.vec3),  # (ray)
+    points: wp.array(dtype=wp.vec3),  # (sample), moved out of the solid in place
+    inside_out: wp.array(dtype=wp.int32),  # (sample)
+):
+    world, sample = wp.tid()
+    sample += first
+    point = points[sample]
+    hits = int(0)
+    back_faces = int(0)
+    for ray in range(rays.shape[0]):
+        hit = wp.mesh_query_ray(mesh, point, rays[ray], reach)
+        if hit.result:
+            hits += 1
+            if hit.sign < 0.0:
+                back_faces += 1
+    inside = 2 * back_faces > hits
+    inside_out[sample] = wp.where(inside, 1, 0)
+    if inside:
+        # Walk out along the radius until as many layers were left as entered: parts of a body may overlap.
+        outward = wp.normalize(point - center)
+        depth = int(0)
+        walk = point
+        for _layer in range(MOST_LAYERS):
+            hit = wp.mesh_query_ray(mesh, walk, outward, reach)
+            if hit.result:
+                depth += wp.where(hit.sign < 0.0, 1, -1)
+                walk += (hit.t + nudge) * outward
+        # `depth` is how many layers lie over the point; cross that many and stop in the open.
+        for _layer in range(MOST_LAYERS):
+            if depth > 0:
+                hit = wp.mesh_query_ray(mesh, point, outward, reach)
+                if hit.result:
+                    depth -= wp.where(hit.sign < 0.0, 1, -1)
+                    point += (hit.t + nudge) * outward
+                else:
+                    depth = 0
+        points[sample] = point
+
+
+def leave_solid(
+    mesh: wp.Mesh, center: np.ndarray, radius: float, points: np.ndarray, device: wp.Device
+) -> tuple[np.ndarray, np.ndarray]:
+    """Moves the points that lie inside the solid along their radius to its surface.
+
+    Returns the moved points, float32 [N, 3], and which ones were inside, bool [N]. A point counts as inside when most
+    rays from it meet a back face first, which also serves open meshes.
+    """
+    rays = wp.array(sphere.fibonacci_cap(RAYS_INSIDE_TEST, math.pi), dtype=wp.vec3, device=device)
+    moved = wp.array(points, dtype=wp.vec3, device=device)
+    inside = wp.zeros(len(points), dtype=wp.int32, device=device)
+    nudge = SURFACE_OFFSET * radius
+    inputs = [mesh.id, wp.vec3(*map(float, center)), 4.0 * radius, nudge, rays, moved]
+    launch(_leave_solid, (1, len(points)), inputs, [inside], device)
+    return moved.numpy(), inside.numpy().astype(bool)
+
+
+def project_coverage(
+    mesh: wp.Mesh,
+    points: np.ndarray,
+    axes: np.ndarray,
+    half_angle: float,
+    ray_count: int,
+    order: int,
+    device: wp.Device,
+    face_radiance: np.ndarray | None = None,
+) -> np.ndarray:
+    """Coverage of the directions around points, projected on SH; float32 [N, order^2].
+
+    points: float32 [N, 3] in the body's frame, metres; axes: unit vectors [N, 3], the axes of the cones of rays;
+    half_angle: of the cones, radians; face_radiance: float [faces], if given, weights each covered direction with the
+    radiance of the face seen there (front faces only).
+    """
+    kit = make_visibility(order)
+    local = sphere.fibonacci_cap(ray_count, half_angle)
+    ray_solid_angle = 2 * math.pi * (1 - math.cos(half_angle)) / ray_count
+    out = wp.zeros(len(points), dtype=kit.vec, device=device)
+    reach = 4.0 * float(np.abs(points).max() + np.abs(mesh.points.numpy()).max())
+    inputs = [
+        wp.array(points, dtype=wp.vec3, device=device),
+        wp.array(axes, dtype=wp.vec3, device=device),
+        reach,
+        wp.array(local, dtype=wp.vec3, device=device),
+        wp.array(sh.evaluate(local, order) * ray_solid_angle, dtype=kit.vec, device=device),
+        *_rotation_tables(order, device),
+    ]
+    if face_radiance is None:
+        launch(kit.project_coverage, (1, len(points)), [mesh.id, *inputs], [out], device)
+    else:
+        radiance = wp.array(face_radiance, dtype=wp.float32, device=device)
+        launch(kit.project_radiance, (1, len(points)), [mesh.id, radiance, *inputs], [out], device)
+    return out.numpy()
+
+
+def project_blocked_hemisphere(
+    mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, ray_count: int, order: int, device: wp.Device
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the body hides of the hemispheres about `normals` at `points` [N, 3] of its surface.
+
+    Returns two float32 [N, order^2]: the blocked part projected alone, and projected together with the cosine.
+    """
+    kit = make_visibility(order)
+    local = sphere.fibonacci_cap(ray_count, math.pi / 2)
+    outs = [wp.zeros(len(points), dtype=kit.vec, device=device) for _ in range(2)]
+    inputs = [
+        mesh.id,
+        wp.array(points, dtype=wp.vec3, device=device),
+        wp.array(normals, dtype=wp.vec3, device=device),
+        4.0 * float(np.abs(points).max()),
+        wp.array(local, dtype=wp.vec3, device=device),
+        wp.array(sh.evaluate(local, order) * (2 * math.pi / ray_count), dtype=kit.vec, device=device),
+        *_rotation_tables(order, device),
+    ]
+    launch(kit.project_blocked_hemisphere, (1, len(points)), inputs, outs, device)
+    return outs[0].numpy(), outs[1].numpy()
+
+
+def _rotation_tables(order: int, device: wp.Device) -> list[wp.array]:
+    directions, weights = sphere.quadrature(ROTATION_POINTS[order])
+    weighted = sh.evaluate(directions, order) * weights[:, None]
+    vec = make_visibility(order).vec
+    return [wp.array(directions, dtype=wp.vec3, device=device), wp.array(weighted, dtype=vec, device=device)]

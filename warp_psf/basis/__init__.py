@@ -1,0 +1,1 @@
+"""Functions on the sphere, without a scene: directions and quadrature, spherical harmonics."""

@@ -1,0 +1,82 @@
+"""Devices: which one a renderer uses, and how a launch reaches all of its cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import warp as wp
+
+# Each core gets this many pieces of a launch, so that a core with cheap pieces can take over another's.
+PIECES_PER_CORE = 8
+# A piece smaller than this costs more to hand over (about 40 microseconds) than it saves.
+SMALLEST_PIECE = 64
+
+
+def find_device(name: str | None = None) -> wp.Device:
+    """The named device, or by default the first CUDA device, else the CPU.
+
+    Raises:
+        ValueError: there is no such device on this machine.
+    """
+    _quiet_start()
+    if name is None:
+        return wp.get_device("cuda:0" if wp.get_cuda_device_count() else "cpu")
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError) as error:
+        present = ", ".join(str(device) for device in wp.get_devices())
+        raise ValueError(f"device {name!r} is not on this machine; choose one of: {present}") from error
+
+
+def launch(kernel, dim: tuple[int, int], inputs: Sequence, outputs: Sequence, device: wp.Device) -> None:
+    """Runs `kernel` over `dim` = (worlds, items), on every core of a CPU or as one launch on CUDA.
+
+    A CPU launch runs on one core and releases the interpreter's lock, so the items are cut into pieces that threads
+    launch side by side. Every kernel's first parameter is therefore `first`, the item at which its piece begins:
+
+        world, item = wp.tid()
+        item += first
+    """
+    worlds, items = dim
+    if worlds == 0 or items == 0:
+        return
+    arguments = [*inputs, *outputs]
+    if device.is_cuda:
+        wp.launch(kernel, dim=dim, inputs=[0, *arguments], device=device)
+        return
+    pieces = min(core_count() * PIECES_PER_CORE, max(1, items // SMALLEST_PIECE))
+    bounds = [items * piece // pieces for piece in range(pieces + 1)]
+    if pieces == 1:
+        wp.launch(kernel, dim=dim, inputs=[0, *arguments], device=device)
+        return
+    wp.load_module(kernel.module, device=device, block_dim=1)
+
+    def launch_piece(first: int, last: int) -> None:
+        wp.launch(kernel, dim=(worlds, last - first), inputs=[first, *arguments], device=device, record_tape=False)
+
+    # list() waits for every piece and raises the first error of any.
+    list(_workers().map(launch_piece, bounds[:-1], bounds[1:]))
+
+
+def core_count() -> int:
+    """The CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def _workers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=core_count(), thread_name_prefix="warp_psf")
+
+
+@cache
+def _quiet_start() -> None:
+    # Warp's banner, its compilation notes and its wish for a CUDA driver are not this library's output.
+    wp.config.log_level = wp.LOG_ERROR
+    # Compiling the adjoint of every kernel doubles the first run's wait; who differentiates a kernel turns it on.
+    wp.config.enable_backward = False
+    wp.init()
+
+

@@ -1,0 +1,1 @@
+"""Vectors stored on concentric shells around a body: occlusion and radiance fields."""

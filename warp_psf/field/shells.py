@@ -1,0 +1,224 @@
+"""Shadow fields: SH vectors at sample points on concentric shells around a body (Tamura 2006, sections 3 and 4).
+
+A field holds one vector per sample. In an object occlusion field (OOF) it is the occlusion coefficient vector (OCV):
+the part of the sphere of directions that the body covers, projected on SH. In a source radiance field (SRF) it is the
+radiance coefficient vector (RCV): the same with each covered direction weighted by the radiance that leaves the body
+towards the sample. The papers store visibility, 1 minus coverage; coverage holds the same numbers, falls to zero with
+distance and so needs no special care beyond the last shell.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis import sh
+
+SHELL_COUNT = 32
+# The radius of shell c is SHELL_SPACING * (1 + c) * (radius of the bounding sphere): Tamura 2006, section 6.
+SHELL_SPACING = 0.2
+FINEST_RESOLUTION = 64
+# The smallest resolution of the paper's Table 1; below it the interpolation across the poles has too few azimuths.
+COARSEST_RESOLUTION = 8
+# From this shell on, samples lie outside the bounding sphere, and coverage falls with distance as 1/r^2.
+FIRST_OUTER_SHELL = 4
+
+
+@dataclass(frozen=True)
+class ShadowField:
+    """One body's field, quantised to 8 bits per coefficient.
+
+    center: centre of the shells in the body's frame, metres, float32 [3].
+    radius: radius of the body's bounding sphere, metres.
+    resolutions: samples per axis of each shell, R_c, int32 [SHELL_COUNT]; shell c has R_c x R_c samples.
+    codes: quantised vectors, shell after shell, rows (theta) before columns (phi), uint8 [samples, coefficients].
+    minimum, step: coefficient = minimum + step * code, float32 [SHELL_COUNT, coefficients].
+    """
+
+    center: np.ndarray
+    radius: float
+    resolutions: np.ndarray
+    codes: np.ndarray
+    minimum: np.ndarray
+    step: np.ndarray
+
+    @property
+    def order(self) -> int:
+        """The number of SH bands."""
+        return sh.order_of(self.codes.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """What the samples and their quantisation constants take, bytes."""
+        return self.codes.nbytes + self.minimum.nbytes + self.step.nbytes
+
+    def dequantised(self) -> np.ndarray:
+        """The vectors as float32 [samples, coefficients]."""
+        shell = np.repeat(np.arange(SHELL_COUNT), self.resolutions.astype(np.int64) ** 2)
+        return self.minimum[shell] + self.step[shell] * self.codes
+
+
+def shell_radii(radius: float) -> np.ndarray:
+    """Radii of the shells around a body whose bounding sphere has `radius`, float64 [SHELL_COUNT]."""
+    return SHELL_SPACING * radius * (1 + np.arange(SHELL_COUNT))
+
+
+def sample_directions(resolution: int) -> np.ndarray:
+    """Directions from the centre to the samples of a shell, float64 [resolution, resolution, 3].
+
+    Row s lies at theta = pi (s + 1/2)/R from +z, column t at phi = 2 pi (t + 1/2)/R from +x.
+    """
+    theta = math.pi * (np.arange(resolution) + 0.5) / resolution
+    phi = 2 * math.pi * (np.arange(resolution) + 0.5) / resolution
+    sin_theta = np.sin(theta)[:, None]
+    return np.stack(
+        np.broadcast_arrays(sin_theta * np.cos(phi), sin_theta * np.sin(phi), np.cos(theta)[:, None]), axis=-1
+    )
+
+
+def quantise(center: np.ndarray, radius: float, shells: list[np.ndarray]) -> ShadowField:
+    """Quantises shells [R_c, R_c, coefficients] to 8 bits, with a minimum and a step per shell and coefficient."""
+    minimum = np.stack([shell.min(axis=(0, 1)) for shell in shells]).astype(np.float32)
+    maximum = np.stack([shell.max(axis=(0, 1)) for shell in shells]).astype(np.float32)
+    step = (maximum - minimum) / 255
+    divisor = np.where(step > 0, step, 1)
+    codes = [
+        np.clip(np.rint((shell - minimum[c]) / divisor[c]), 0, 255).astype(np.uint8).reshape(-1, shell.shape[-1])
+        for c, shell in enumerate(shells)
+    ]
+    return ShadowField(
+        center=np.asarray(center, np.float32),
+        radius=float(radius),
+        resolutions=np.array([shell.shape[0] for shell in shells], np.int32),
+        codes=np.concatenate(codes),
+        minimum=minimum,
+        step=step,
+    )
+
+
+@cache
+def make_fields(order: int) -> SimpleNamespace:
+    """The device side of fields with `order` bands: the struct `FieldTable` and the function `lookup_coverage`.
+
+    `FieldTable` holds the fields of all bodies behind one another, dequantised: a fetch is then one vector load.
+    """
+    vec = sh.make_sh(order).vec
+
+    @wp.struct
+    class FieldTable:
+        samples: wp.array(dtype=vec)  # (sample)
+        shell_first: wp.array2d(dtype=wp.int32)  # (field, shell): index of the shell's first sample
+        shell_resolution: wp.array2d(dtype=wp.int32)  # (field, shell)
+        center: wp.array(dtype=wp.vec3)  # (field), in the body's frame
+        radius: wp.array(dtype=wp.float32)  # (field)
+
+    @wp.func
+    def interpolate_shell(table: FieldTable, first: int, resolution: int, theta: float, phi: float) -> vec:
+        # Continuous sample coordinates: sample (s, t) stands at s + 1/2, t + 1/2.
+        row = theta * float(resolution) - 0.5
+        column = phi * float(resolution) - 0.5
+        row_below = int(wp.floor(row))
+        column_below = int(wp.floor(column))
+        u = row - float(row_below)
+        v = column - float(column_below)
+        mask = resolution - 1  # resolutions are powers of two: `& mask` wraps the azimuth, also of -1
+        half = resolution / 2
+        # A row beyond a pole is the same row seen from the other side: half a turn away in azimuth.
+        row_0 = wp.max(row_below, 0)
+        row_1 = wp.min(row_below + 1, mask)
+        turn_0 = wp.where(row_below < 0, half, 0)
+        turn_1 = wp.where(row_below + 1 > mask, half, 0)
+        base_0 = first + row_0 * resolution
+        base_1 = first + row_1 * resolution
+        return (
+            ((1.0 - u) * (1.0 - v)) * table.samples[base_0 + ((column_below + turn_0) & mask)]
+            + ((1.0 - u) * v) * table.samples[base_0 + ((column_below + 1 + turn_0) & mask)]
+            + (u * (1.0 - v)) * table.samples[base_1 + ((column_below + turn_1) & mask)]
+            + (u * v) * table.samples[base_1 + ((column_below + 1 + turn_1) & mask)]
+        )
+
+    @wp.func
+    def lookup_coverage(table: FieldTable, field: int, p_body: wp.vec3) -> vec:
+        """The vector at a point of the body's frame: bilinear on the two nearest shells, then between them."""
+        offset = p_body - table.center[field]
+        distance = wp.max(wp.length(offset), 1.0e-9)  # metres; the centre itself has no direction
+        theta = wp.acos(wp.clamp(offset[2] / distance, -1.0, 1.0)) * wp.static(1.0 / math.pi)
+        phi = wp.atan2(offset[1], offset[0]) * wp.static(0.5 / math.pi)
+
+        # In units of the spacing, shell c has radius c + 1.
+        radius = distance / (table.radius[field] * wp.static(SHELL_SPACING))
+        last = float(wp.static(SHELL_COUNT))
+        clamped = wp.clamp(radius, 1.0, last)
+        inner = wp.min(int(clamped) - 1, wp.static(SHELL_COUNT - 2))
+        r_0 = float(inner + 1)
+        weight = clamped - r_0
+        if inner >= wp.static(FIRST_OUTER_SHELL):
+            # Linear in 1/r^2, as solid angle falls: exact for what is far away.
+            r_1 = r_0 + 1.0
+            weight = (1.0 - (r_0 * r_0) / (clamped * clamped)) / (1.0 - (r_0 * r_0) / (r_1 * r_1))
+        beyond = last / wp.max(radius, last)
+        scale = beyond * beyond
+        return (scale * (1.0 - weight)) * interpolate_shell(
+            table, table.shell_first[field, inner], table.shell_resolution[field, inner], theta, phi
+        ) + (scale * weight) * interpolate_shell(
+            table, table.shell_first[field, inner + 1], table.shell_resolution[field, inner + 1], theta, phi
+        )
+
+    return SimpleNamespace(FieldTable=FieldTable, lookup_coverage=lookup_coverage, vec=vec)
+
+
+def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):
+    """A `FieldTable` of `make_fields(order)` with the given fields, in order."""
+    kit = make_fields(order)
+    table = kit.FieldTable()
+    counts = [field.resolutions.astype(np.int64) ** 2 for field in fields]
+    first = np.cumsum([0, *(count.sum() for count in counts)])[:-1]
+    shell_first = np.array(
+        [start + np.cumsum(count) - count for start, count in zip(first, counts, strict=True)], np.int32
+    ).reshape(-1, SHELL_COUNT)
+    coefficients = sh.coefficient_count(order)
+    samples = np.concatenate([field.dequantised() for field in fields] or [np.zeros((0, coefficients), np.float32)])
+    table.samples = wp.array(samples, dtype=kit.vec, device=device)
+    table.shell_first = wp.array(shell_first, dtype=wp.int32, ndim=2, device=device)
+    resolutions = np.array([field.resolutions for field in fields], np.int32).reshape(-1, SHELL_COUNT)
+    table.shell_resolution = wp.array(resolutions, dtype=wp.int32, ndim=2, device=device)
+    centers = np.array([field.center for field in fields], np.float32).reshape(-1, 3)
+    table.center = wp.array(centers, dtype=wp.vec3, device=device)
+    table.radius = wp.array([field.radius for field in fields], dtype=wp.float32, device=device)
+    return table
+
+
+def lookup(field: ShadowField, points_body: np.ndarray) -> np.ndarray:
+    """The vectors at points of the body's frame [N, 3], float64 [N, coefficients]: the twin of `lookup_coverage`."""
+    offset = np.asarray(points_body, np.float64) - field.center
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
+    theta = np.arccos(np.clip(offset[:, 2] / distance, -1, 1)) / math.pi
+    phi = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * math.pi)
+    radius = distance / (SHELL_SPACING * field.radius)
+    clamped = np.clip(radius, 1, SHELL_COUNT)
+    inner = np.minimum(clamped.astype(int) - 1, SHELL_COUNT - 2)
+    r_0, r_1 = inner + 1.0, inner + 2.0
+    outer_weight = (1 - (r_0 / clamped) ** 2) / (1 - (r_0 / r_1) ** 2)
+    weight = np.where(inner >= FIRST_OUTER_SHELL, outer_weight, clamped - r_0)[:, None]
+    scale = (SHELL_COUNT / np.maximum(radius, SHELL_COUNT))[:, None] ** 2
+    samples = field.dequantised().astype(np.float64)
+    first = np.cumsum(field.resolutions**2) - field.resolutions**2
+
+    def on_shell(shell: np.ndarray) -> np.ndarray:
+        resolution = field.resolutions[shell]
+        row, column = theta * resolution - 0.5, phi * resolution - 0.5
+        row_below, column_below = np.floor(row).astype(int), np.floor(column).astype(int)
+        total = np.zeros((len(points_body), samples.shape[1]))
+        for step_row, step_column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            s, t = row_below + step_row, column_below + step_column
+            beyond_pole = (s < 0) | (s >= resolution)
+            t = (t + np.where(beyond_pole, resolution // 2, 0)) % resolution
+            s = np.clip(s, 0, resolution - 1)
+            share = np.abs(1 - step_row - (row - row_below)) * np.abs(1 - step_column - (column - column_below))
+            total += share[:, None] * samples[first[shell] + s * resolution + t]
+        return total
+
+    return scale * ((1 - weight) * on_shell(inner) + weight * on_shell(inner + 1))

@@ -1,0 +1,285 @@
+"""Primary visibility: which surfaces each pixel sees, and with which shares.
+
+Every pixel traces its centre. Where neighbouring pixels see different surfaces, the pixel is traced again at eight
+places, its samples are grouped by surface, and each group becomes a receiver of its own with the group's share as its
+weight: edges are antialiased and nothing is shaded twice.
+
+The receivers of a world are numbered so that slot p < pixels is the centre of pixel p (or its first group), and
+EXTRA_GROUPS further slots belong to each edge pixel, in the order of the pixels.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_psf.device import launch
+from warp_psf.scene.camera import Camera
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.receiver import ReceiverTable, make_receivers
+
+SAMPLES = 8
+EXTRA_GROUPS = 3
+# Neighbouring pixels lie on one smooth surface when their normals differ by less than acos(0.9), about 26 degrees,
+# and their depths by less than this share plus what the surface's tilt explains.
+SAME_NORMAL = wp.constant(0.9)
+SAME_DEPTH = wp.constant(0.02)
+# Room for edge pixels, as a share of all; further edges of a picture that is nearly all edge stay aliased.
+EDGE_SHARE = 1.0 / 3.0
+
+
+@wp.struct
+class CameraTable:
+    position: wp.array(dtype=wp.vec3)  # (world), metres
+    rotation: wp.array(dtype=wp.mat33)  # (world), world_from_camera
+    tangent: wp.array(dtype=wp.float32)  # (world): tan(fovy / 2)
+    width: wp.int32
+    height: wp.int32
+
+
+@wp.struct
+class Hit:
+    entity: wp.int32
+    face: wp.int32
+    u: wp.float32
+    v: wp.float32
+    distance: wp.float32
+    position: wp.vec3
+    normal: wp.vec3
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What the camera sees: receivers, and per pixel its first extra slot (-1: none)."""
+
+    receivers: ReceiverTable
+    extra: wp.array  # (world, pixel) int32
+    edge: wp.array  # (world, pixel) int32, 1 on edge pixels
+    edge_rank: wp.array  # (world, pixel) int32, running count of edge pixels
+    edge_capacity: int
+    camera: CameraTable
+
+    @property
+    def slots(self) -> int:
+        """Receiver slots per world."""
+        return self.receivers.entity.shape[1]
+
+
+@wp.func
+def sample_offset(sample: int) -> wp.vec2:
+    """Eight places in a pixel, one in each row and column of an 8 x 8 grid."""
+    column = (sample * 5 + 2) % 8
+    return wp.vec2((float(column) + 0.5) / 8.0, (float(sample) + 0.5) / 8.0)
+
+
+@wp.func
+def camera_ray(camera: CameraTable, world: int, x: float, y: float) -> wp.vec3:
+    """Direction through the film at pixel coordinates (x, y), of unit depth along the optical axis."""
+    scale = 2.0 * camera.tangent[world] / float(camera.height)
+    right = (x - 0.5 * float(camera.width)) * scale
+    up = (0.5 * float(camera.height) - y) * scale
+    return camera.rotation[world] * wp.vec3(right, up, -1.0)
+
+
+@wp.func
+def trace(geometry: GeometryTable, poses: PoseTable, world: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
+    """The nearest surface along a ray; `distance` is in units of `direction`, entity -1 is nothing."""
+    hit = Hit()
+    hit.entity = -1
+    nearest = float(1.0e30)
+    length_squared = wp.dot(direction, direction)
+    for entity in range(geometry.entity_mesh.shape[0]):
+        position = poses.position[world, entity]
+        rotation = poses.rotation[world, entity]
+        to_center = position + rotation * geometry.center[entity] - origin
+        along = wp.dot(to_center, direction)
+        radius = geometry.radius[entity]
+        # Discriminant of the ray against the bounding sphere, and whether the sphere lies ahead and near enough.
+        reach = along * along - length_squared * (wp.dot(to_center, to_center) - radius * radius)
+        if reach >= 0.0:
+            root = wp.sqrt(reach)
+            if along + root > 0.0 and along - root < nearest * length_squared:
+                inverse = wp.transpose(rotation)
+                query = wp.mesh_query_ray(
+                    geometry.mesh_id[geometry.entity_mesh[entity]],
+                    inverse * (origin - position),
+                    inverse * direction,
+                    nearest,
+                )
+                if query.result:
+                    nearest = query.t
+                    hit.entity = entity
+                    hit.face = query.face
+                    hit.u = query.u
+                    hit.v = query.v
+                    hit.normal = query.normal
+    if hit.entity >= 0:
+        hit.distance = nearest
+        hit.position = origin + nearest * direction
+        rotation = poses.rotation[world, hit.entity]
+        flat = rotation * hit.normal
+        mesh = geometry.entity_mesh[hit.entity]
+        corners = geometry.faces[geometry.first_face[mesh] + hit.face]
+        start = geometry.first_vertex[mesh]
+        smooth = (
+            hit.u * geometry.normals[start + corners[0]]
+            + hit.v * geometry.normals[start + corners[1]]
+            + (1.0 - hit.u - hit.v) * geometry.normals[start + corners[2]]
+        )
+        normal = wp.normalize(rotation * smooth)
+        if wp.dot(flat, direction) > 0.0:
+            normal = -normal  # the back of an open surface
+        hit.normal = normal
+    return hit
+
+
+@wp.func
+def store_hit(receivers: ReceiverTable, world: int, slot: int, hit: Hit, weight: float):
+    receivers.entity[world, slot] = hit.entity
+    receivers.face[world, slot] = hit.face
+    receivers.uv[world, slot] = wp.vec2(hit.u, hit.v)
+    receivers.position[world, slot] = hit.position
+    receivers.normal[world, slot] = hit.normal
+    receivers.depth[world, slot] = hit.distance
+    receivers.weight[world, slot] = weight
+
+
+@wp.kernel(module="unique")
+def _trace_centers(
+    first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, receivers: ReceiverTable
+):
+    world, pixel = wp.tid()
+    pixel += first
+    x = float(pixel % camera.width) + 0.5
+    y = float(pixel / camera.width) + 0.5
+    hit = trace(geometry, poses, world, camera.position[world], camera_ray(camera, world, x, y))
+    store_hit(receivers, world, pixel, hit, wp.where(hit.entity >= 0, 1.0, 0.0))
+
+
+@wp.func
+def same_surface(receivers: ReceiverTable, world: int, a: int, b: int) -> bool:
+    if receivers.entity[world, a] != receivers.entity[world, b]:
+        return False
+    if receivers.entity[world, a] < 0:
+        return True
+    if wp.dot(receivers.normal[world, a], receivers.normal[world, b]) < SAME_NORMAL:
+        return False
+    # The neighbour may lie off the tangent plane by a share of the depth, or of the distance to it.
+    offset = receivers.position[world, b] - receivers.position[world, a]
+    away = wp.abs(wp.dot(offset, receivers.normal[world, a]))
+    return away < SAME_DEPTH * receivers.depth[world, a] + 0.5 * wp.length(offset)
+
+
+@wp.kernel(module="unique")
+def _find_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge_out: wp.array2d(dtype=wp.int32)):
+    world, pixel = wp.tid()
+    pixel += first
+    x = pixel % camera.width
+    y = pixel / camera.width
+    smooth = bool(True)
+    if x > 0:
+        smooth = smooth and same_surface(receivers, world, pixel, pixel - 1)
+    if x + 1 < camera.width:
+        smooth = smooth and same_surface(receivers, world, pixel, pixel + 1)
+    if y > 0:
+        smooth = smooth and same_surface(receivers, world, pixel, pixel - camera.width)
+    if y + 1 < camera.height:
+        smooth = smooth and same_surface(receivers, world, pixel, pixel + camera.width)
+    edge_out[world, pixel] = wp.where(smooth, 0, 1)
+
+
+@wp.kernel(module="unique")
+def _trace_edges(
+    first: int,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    camera: CameraTable,
+    edge: wp.array2d(dtype=wp.int32),
+    edge_rank: wp.array2d(dtype=wp.int32),
+    edge_capacity: int,
+    receivers: ReceiverTable,
+    extra_out: wp.array2d(dtype=wp.int32),
+):
+    world, pixel = wp.tid()
+    pixel += first
+    extra_out[world, pixel] = -1
+    rank = edge_rank[world, pixel] - edge_rank[world, 0]
+    if edge[world, pixel] == 1 and rank < edge_capacity:
+        slot = camera.width * camera.height + wp.static(EXTRA_GROUPS) * rank
+        extra_out[world, pixel] = slot
+        share = 1.0 / float(wp.static(SAMPLES))
+        entities = wp.vec4i(receivers.entity[world, pixel], -1, -1, -1)
+        normals = wp.matrix(shape=(4, 3), dtype=float)
+        normals[0] = receivers.normal[world, pixel]
+        weights = wp.vec4()
+        groups = int(wp.where(entities[0] >= 0, 1, 0))
+        x = float(pixel % camera.width)
+        y = float(pixel / camera.width)
+        samples = int(wp.static(SAMPLES))  # a variable keeps the loop from being unrolled
+        for sample in range(samples):
+            offset = sample_offset(sample)
+            ray = camera_ray(camera, world, x + offset[0], y + offset[1])
+            hit = trace(geometry, poses, world, camera.position[world], ray)
+            if hit.entity >= 0:
+                found = int(-1)
+                for group in range(groups):
+                    if entities[group] == hit.entity and (
+                        found < 0 or wp.dot(normals[group], hit.normal) > wp.dot(normals[found], hit.normal)
+                    ):
+                        found = group
+                known = found >= 0
+                if known:
+                    known = wp.dot(normals[found], hit.normal) > SAME_NORMAL
+                if not known and groups < wp.static(EXTRA_GROUPS + 1):
+                    found = groups
+                    entities[found] = hit.entity
+                    normals[found] = hit.normal
+                    if found == 0:
+                        store_hit(receivers, world, pixel, hit, 0.0)
+                    else:
+                        store_hit(receivers, world, slot + found - 1, hit, 0.0)
+                    groups += 1
+                weights[wp.max(found, 0)] += share
+        receivers.weight[world, pixel] = weights[0]
+        for group in range(1, groups):
+            receivers.weight[world, slot + group - 1] = weights[group]
+        for group in range(wp.max(groups, 1), wp.static(EXTRA_GROUPS + 1)):
+            receivers.entity[world, slot + group - 1] = -1
+
+
+def make_surfaces(worlds: int, width: int, height: int, device: wp.Device) -> Surfaces:
+    """Room for the surfaces of a film of width x height pixels."""
+    pixels = width * height
+    capacity = math.ceil(EDGE_SHARE * pixels)
+    shape = (worlds, pixels + EXTRA_GROUPS * capacity)
+    receivers = make_receivers(shape, device)
+    receivers.entity.fill_(-1)
+    camera = CameraTable()
+    camera.position = wp.zeros(worlds, dtype=wp.vec3, device=device)
+    camera.rotation = wp.zeros(worlds, dtype=wp.mat33, device=device)
+    camera.tangent = wp.zeros(worlds, dtype=wp.float32, device=device)
+    camera.width, camera.height = width, height
+    extra, edge, rank = (wp.zeros((worlds, pixels), dtype=wp.int32, device=device) for _ in range(3))
+    return Surfaces(receivers, extra, edge, rank, capacity, camera)
+
+
+def aim(surfaces: Surfaces, cameras: list[Camera]) -> None:
+    """Points the film's camera, one per world."""
+    table = surfaces.camera
+    table.position.assign(np.array([camera.position for camera in cameras], np.float32))
+    table.rotation.assign(np.array([camera.rotation for camera in cameras], np.float32))
+    table.tangent.assign(np.array([math.tan(0.5 * camera.fovy) for camera in cameras], np.float32))
+
+
+def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> None:
+    """Fills `surfaces` with what the camera sees of the scene in its present poses."""
+    camera, receivers = surfaces.camera, surfaces.receivers
+    dim = surfaces.edge.shape
+    launch(_trace_centers, dim, [scene.geometry, scene.poses, camera, receivers], [], device)
+    launch(_find_edges, dim, [camera, receivers], [surfaces.edge], device)
+    wp.utils.array_scan(surfaces.edge.flatten(), surfaces.edge_rank.flatten(), inclusive=False)
+    # What an earlier frame left in slots that this frame's edges do not reach.
+    receivers.entity[:, dim[1] :].fill_(-1)
+    inputs = [scene.geometry, scene.poses, camera, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, receivers]
+    launch(_trace_edges, dim, inputs, [surfaces.extra], device)

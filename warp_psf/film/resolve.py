@@ -1,0 +1,140 @@
+"""From shaded receivers to the layers of a frame."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_psf.device import launch
+from warp_psf.film.primary import EXTRA_GROUPS, SAMPLES, CameraTable, Surfaces, camera_ray
+from warp_psf.scene.geometry import DeviceScene, GeometryTable
+from warp_psf.scene.receiver import ReceiverTable
+
+
+@wp.struct
+class LayerTable:
+    """The layers of a frame, (world, pixel), radiance scene-linear."""
+
+    color: wp.array2d(dtype=wp.vec3)
+    direct: wp.array2d(dtype=wp.vec3)
+    albedo: wp.array2d(dtype=wp.vec3)
+    normal: wp.array2d(dtype=wp.vec3)
+    depth: wp.array2d(dtype=wp.float32)
+    segmentation: wp.array2d(dtype=wp.vec2i)
+
+
+@dataclass(frozen=True)
+class Film:
+    """The layers and the background behind them."""
+
+    layers: LayerTable
+    background: wp.array  # latitude-longitude radiance, vec3 (row, column)
+    height: int
+    width: int
+
+
+@wp.func
+def look_up(image: wp.array2d(dtype=wp.vec3), direction: wp.vec3) -> wp.vec3:
+    """Bilinear in a latitude-longitude image, periodic in azimuth."""
+    rows = image.shape[0]
+    columns = image.shape[1]
+    d = wp.normalize(direction)
+    y = wp.acos(wp.clamp(d[2], -1.0, 1.0)) * wp.static(1.0 / math.pi) * float(rows) - 0.5
+    x = (wp.atan2(d[1], d[0]) * wp.static(0.5 / math.pi) + 1.0) * float(columns) - 0.5
+    row = int(wp.floor(y))
+    column = int(wp.floor(x))
+    v = y - float(row)
+    u = x - float(column)
+    row_0 = wp.clamp(row, 0, rows - 1)
+    row_1 = wp.clamp(row + 1, 0, rows - 1)
+    column_0 = column % columns
+    column_1 = (column + 1) % columns
+    return (1.0 - v) * ((1.0 - u) * image[row_0, column_0] + u * image[row_0, column_1]) + v * (
+        (1.0 - u) * image[row_1, column_0] + u * image[row_1, column_1]
+    )
+
+
+@wp.kernel(module="unique")
+def _resolve_pixels(
+    first: int,
+    geometry: GeometryTable,
+    camera: CameraTable,
+    receivers: ReceiverTable,
+    extra: wp.array2d(dtype=wp.int32),  # (world, pixel)
+    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    background: wp.array2d(dtype=wp.vec3),
+    layers: LayerTable,
+):
+    world, pixel = wp.tid()
+    pixel += first
+    x = float(pixel % camera.width) + 0.5
+    y = float(pixel / camera.width) + 0.5
+    start = extra[world, pixel]
+    groups = wp.where(start >= 0, wp.static(EXTRA_GROUPS + 1), 1)
+    light = wp.vec3()
+    shine = wp.vec3()
+    albedo = wp.vec3()
+    normal = wp.vec3()
+    covered = float(0.0)
+    for group in range(groups):
+        slot = wp.where(group == 0, pixel, start + group - 1)
+        entity = receivers.entity[world, slot]
+        if entity >= 0:
+            weight = receivers.weight[world, slot]
+            reflectance = geometry.albedo[entity]
+            light += weight * (
+                wp.cw_mul(reflectance, diffuse[world, slot]) * wp.static(1.0 / math.pi)
+                + wp.cw_mul(geometry.specular[entity], glossy[world, slot])
+            )
+            shine += weight * geometry.emission[entity]
+            albedo += weight * reflectance
+            normal += weight * receivers.normal[world, slot]
+            covered += weight
+    layers.direct[world, pixel] = light
+    color = light + shine
+    if covered < 1.0 - wp.static(0.5 / SAMPLES):
+        color += (1.0 - covered) * look_up(background, camera_ray(camera, world, x, y))
+    layers.color[world, pixel] = color
+    layers.albedo[world, pixel] = albedo
+    layers.normal[world, pixel] = wp.normalize(normal)
+
+    # Depth and segmentation are those of the pixel's centre: a mean of two bodies is neither.
+    depth = float(wp.inf)
+    objects = wp.vec2i(-1, -1)
+    entity = receivers.entity[world, pixel]
+    if entity >= 0:
+        depth = receivers.depth[world, pixel]
+        objects = wp.vec2i(geometry.object_id[entity], geometry.object_type[entity])
+    layers.depth[world, pixel] = depth
+    layers.segmentation[world, pixel] = objects
+
+
+def make_film(worlds: int, width: int, height: int, background: np.ndarray, device: wp.Device) -> Film:
+    """Room for the layers of width x height pixels before a background, radiance float32 [rows, columns, 3]."""
+    table = LayerTable()
+    shape = (worlds, width * height)
+    for name in ("color", "direct", "albedo", "normal"):
+        setattr(table, name, wp.zeros(shape, dtype=wp.vec3, device=device))
+    table.depth = wp.zeros(shape, dtype=wp.float32, device=device)
+    table.segmentation = wp.zeros(shape, dtype=wp.vec2i, device=device)
+    return Film(table, wp.array(background, dtype=wp.vec3, ndim=2, device=device), height, width)
+
+
+def resolve_pixels(
+    film: Film, surfaces: Surfaces, scene: DeviceScene, diffuse: wp.array, glossy: wp.array, device: wp.Device
+) -> None:
+    """Writes the film's layers from what the surfaces' receivers received, vec3 (world, slot)."""
+    inputs = [scene.geometry, surfaces.camera, surfaces.receivers, surfaces.extra, diffuse, glossy, film.background]
+    launch(_resolve_pixels, surfaces.extra.shape, [*inputs, film.layers], [], device)
+
+
+def read_layers(film: Film, world: int = 0) -> dict[str, np.ndarray]:
+    """One world's layers on the host, [height, width, ...]."""
+    size = (film.height, film.width)
+    layers = {}
+    for name in ("color", "direct", "albedo", "normal", "depth", "segmentation"):
+        values = getattr(film.layers, name).numpy()[world]
+        layers[name] = values.reshape(*size, *values.shape[1:]).copy()
+    return layers

@@ -1,0 +1,329 @@
+"""The renderer that simulation scripts use, shaped like mujoco.Renderer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from warp_psf.bake import BakedBody, bake_mesh, bake_radiance_field
+from warp_psf.bridge import build_scene, read_camera, read_delta_lights, read_poses
+from warp_psf.device import find_device
+from warp_psf.film.display import VIEWS, to_display
+from warp_psf.film.primary import aim, find_surfaces, make_surfaces
+from warp_psf.film.resolve import make_film, read_layers, resolve_pixels
+from warp_psf.scene.environment import Environment, load_environment
+from warp_psf.scene.geometry import upload_scene, write_poses
+from warp_psf.scene.light import DeltaLight, Light, area_light_entities
+from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
+from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
+from warp_psf.shade.occlude import turn_occlusion, upload_occlusion
+from warp_psf.shade.receivers import interpolate_vertices, place_vertices, upload_vertices
+
+ORDERS = (2, 3, 4, 5, 6)
+SHADINGS = ("pixel", "vertex")
+# A picture of more pixels than this is a mistyped size: its buffers would take over 30 GB.
+MOST_PIXELS = 2**27
+# Shadow rays towards directional lights end after this many extents of the model.
+DIRECTIONAL_REACH = 1000.0
+Progress = Callable[[str, float], None]
+
+
+class Renderer:
+    """Renders a MuJoCo model with soft shadows, frame after frame, without noise.
+
+        with warp_psf.Renderer(model, 360, 640) as renderer:
+            renderer.update_scene(data, camera="front")
+            rgb = renderer.render()
+
+    model: the compiled model. height, width: of the picture, pixels.
+    environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
+        HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
+    lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
+    order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
+    shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates.
+    material_space: whether MJCF's rgba is "srgb" or "linear".
+    model_lights: False leaves out the model's own lights and headlight.
+    exposure, view: how `render` develops the picture: stops, and a view transform, "neutral" or "srgb".
+    device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
+    progress: called as progress(what, share) while shadow fields are baked, which happens once per shape and is cached.
+
+    Raises:
+        ValueError: a size, order, name or device is not usable; the message says which and what is.
+        FileNotFoundError: the environment's file does not exist.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        height: int = 240,
+        width: int = 320,
+        *,
+        environment: str | np.ndarray | Environment | None = "studio",
+        lights: Sequence[Light] = (),
+        order: int = 4,
+        shading: str = "pixel",
+        material_space: str = "srgb",
+        model_lights: bool = True,
+        exposure: float = 0.0,
+        view: str = "neutral",
+        device: str | None = None,
+        progress: Progress | None = None,
+    ):
+        _check_options(height, width, order, shading, exposure, view)
+        self._model, self._height, self._width = model, int(height), int(width)
+        self._order, self._shading = order, shading
+        self._exposure, self._view = exposure, view
+        self._device = find_device(device)
+        self._environment = load_environment(environment)
+        self._scene = build_scene(
+            model, material_space=material_space, lights=lights, model_lights=model_lights
+        )
+        self._upload(self._bake(progress or (lambda what, share: None)))
+        self._depth_rendering = self._segmentation_rendering = False
+        self._world_from_camera: np.ndarray | None = None
+        self._drawn = self._closed = False
+        self._stage_seconds: dict[str, float] = {}
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model that is rendered."""
+        return self._model
+
+    @property
+    def height(self) -> int:
+        """Rows of the picture."""
+        return self._height
+
+    @property
+    def width(self) -> int:
+        """Columns of the picture."""
+        return self._width
+
+    @property
+    def world_from_camera(self) -> np.ndarray:
+        """The camera's pose as of the last `update_scene`, float64 [4, 4]; it looks along its -z."""
+        if self._world_from_camera is None:
+            raise RuntimeError("there is no camera yet; call update_scene(data, camera) first")
+        return self._world_from_camera
+
+    @property
+    def stage_seconds(self) -> dict[str, float]:
+        """How long each stage of the last frame took, seconds, in order."""
+        return dict(self._stage_seconds)
+
+    @property
+    def occluders(self) -> int:
+        """How many entities cast shadows."""
+        return sum(self._casts)
+
+    @property
+    def vertices(self) -> int:
+        """How many vertices all entities have together."""
+        return sum(len(self._scene.meshes[entity.mesh].vertices) for entity in self._scene.entities)
+
+    def update_scene(self, data: mujoco.MjData, camera: int | str | mujoco.MjvCamera = -1) -> None:
+        """Takes over the state that the next `render` shows.
+
+        camera: a camera's id or name, -1 for the free camera, or an `MjvCamera`.
+
+        Raises:
+            ValueError: there is no such camera, or `data` is of another model.
+        """
+        self._check_open()
+        view = read_camera(self._model, data, camera)
+        poses = read_poses(self._model, data, self._scene)
+        lights = read_delta_lights(self._model, data, self._scene, view)
+        write_poses(self._device_scene, poses)
+        aim(self._surfaces, [view])
+        self._lighting.table.eye.assign(np.array([view.position], np.float32))
+        write_delta_lights(self._delta_lights, [lights])
+        self._world_from_camera = np.eye(4)
+        self._world_from_camera[:3, :3], self._world_from_camera[:3, 3] = view.rotation, view.position
+        self._drawn = False
+
+    def render(self, *, out: np.ndarray | None = None) -> np.ndarray:
+        """The picture of the last `update_scene`.
+
+        Returns uint8 [height, width, 3], ready to be shown; with depth rendering on, float32 [height, width], metres;
+        with segmentation rendering on, int32 [height, width, 2], object ids and types. `out` receives it if given.
+
+        Raises:
+            RuntimeError: `update_scene` was not called, or the renderer is closed.
+            ValueError: `out` has another shape or type.
+        """
+        self._draw()
+        if self._depth_rendering:
+            depth = read_layers(self._film)["depth"]
+            far = self._model.vis.map.zfar * self._model.stat.extent
+            picture = np.minimum(depth, np.float32(far))
+        elif self._segmentation_rendering:
+            picture = read_layers(self._film)["segmentation"]
+        else:
+            with self._timed("display"):
+                color = self._film.layers.color.numpy()[0].reshape(self._height, self._width, 3)
+                picture = to_display(color, exposure=self._exposure, view=self._view)
+        if out is None:
+            return picture
+        if out.shape != picture.shape or out.dtype != picture.dtype:
+            raise ValueError(
+                f"out is {out.dtype} {out.shape}; this picture is {picture.dtype} {picture.shape}: give an array like it"
+            )
+        np.copyto(out, picture)
+        return out
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """The layers of the last `update_scene`, as arrays of their own.
+
+        `color`: radiance with background and luminous surfaces; `direct`: light reflected once; `albedo`; `normal` in
+        the world: all float32 [height, width, 3], scene-linear. `depth`: metres along the optical axis, infinite where
+        nothing is, float32 [height, width]. `segmentation`: object id and type, -1 where nothing is, int32
+        [height, width, 2].
+        """
+        self._draw()
+        return read_layers(self._film)
+
+    def enable_depth_rendering(self) -> None:
+        """From now on `render` returns depth."""
+        self._depth_rendering, self._segmentation_rendering = True, False
+
+    def disable_depth_rendering(self) -> None:
+        """`render` returns pictures again."""
+        self._depth_rendering = False
+
+    def enable_segmentation_rendering(self) -> None:
+        """From now on `render` returns object ids and types."""
+        self._depth_rendering, self._segmentation_rendering = False, True
+
+    def disable_segmentation_rendering(self) -> None:
+        """`render` returns pictures again."""
+        self._segmentation_rendering = False
+
+    def close(self) -> None:
+        """Gives back the device's memory. A closed renderer renders no more; closing twice is no error."""
+        if not self._closed:
+            self._closed = True
+            del self._device_scene, self._surfaces, self._film, self._occlusion, self._lighting
+            del self._delta_lights, self._received, self._vertices
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self.close()
+
+    def _bake(self, progress: Progress) -> list[BakedBody]:
+        """Every mesh's baked body; those of entities that only shine are not needed as occluders."""
+        bodies = []
+        for mesh in self._scene.meshes:
+
+            def report(share: float, name: str = mesh.name) -> None:
+                progress(f"baking {name}", share)
+
+            bodies.append(bake_mesh(mesh, self._order, device=str(self._device), progress=report))
+        return bodies
+
+    def _upload(self, bodies: list[BakedBody]) -> None:
+        scene, device, order = self._scene, self._device, self._order
+        area_lights = area_light_entities(scene)
+        fields = [bodies[entity.mesh].field for entity in scene.entities]
+        for light, entity in area_lights:
+            if fields[entity] is not None:
+                radiance = np.ones(len(light.mesh.faces), np.float32)
+                fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
+        self._casts = [entity < len(scene.entities) - len(area_lights) for entity in range(len(scene.entities))]
+        transfers = [
+            None if body.transfer is None or body.visibility is None else (body.transfer, body.visibility)
+            for body in bodies
+        ]
+
+        self._device_scene = upload_scene(scene, 1, device)
+        self._occlusion = upload_occlusion(scene, fields, self._casts, order, 1, device)
+        shining = [(entity, light.radiance) for light, entity in area_lights]
+        self._lighting = upload_lighting(scene, transfers, shining, order, 1, device)
+        background = np.zeros((1, 1, 3), np.float32)
+        if self._environment is not None:
+            write_environment(self._lighting, self._environment.project(order))
+            background = self._environment.radiance
+        deltas = sum(isinstance(light, DeltaLight) for light in scene.lights)
+        reach = DIRECTIONAL_REACH * float(self._model.stat.extent)
+        self._delta_lights = make_delta_lights(deltas, 1, reach, device)
+
+        self._surfaces = make_surfaces(1, self._width, self._height, device)
+        self._film = make_film(1, self._width, self._height, background, device)
+        self._received = self._make_received(self._surfaces.slots)
+        self._vertices = None
+        if self._shading == "vertex":
+            self._vertices = upload_vertices(scene, 1, device)
+            self._vertices_received = self._make_received(self.vertices)
+
+    def _make_received(self, count: int) -> tuple[wp.array, wp.array]:
+        """Irradiance and Phong radiance of `count` receivers."""
+        return (
+            wp.zeros((1, count), dtype=wp.vec3, device=self._device),
+            wp.zeros((1, count), dtype=wp.vec3, device=self._device),
+        )
+
+    def _draw(self) -> None:
+        """Computes the layers, unless they show the present state already."""
+        self._check_open()
+        if self._world_from_camera is None:
+            raise RuntimeError("there is nothing to render yet; call update_scene(data, camera) first")
+        if self._drawn:
+            return
+        self._stage_seconds = {}
+        scene, device, pixels = self._device_scene, self._device, self._surfaces.receivers
+        with self._timed("primary visibility"):
+            find_surfaces(scene, self._surfaces, device)
+        with self._timed("turn fields"):
+            turn_occlusion(self._occlusion, scene, device)
+        if self._vertices is None:
+            self._shade(pixels, self._received)
+        else:
+            with self._timed("place vertices"):
+                place_vertices(self._vertices, pixels, scene, device)
+            self._shade(self._vertices.receivers, self._vertices_received)
+            with self._timed("interpolate vertices"):
+                interpolate_vertices(self._vertices, pixels, scene, self._vertices_received, *self._received, device)
+        with self._timed("resolve pixels"):
+            resolve_pixels(self._film, self._surfaces, scene, *self._received, device)
+        self._drawn = True
+
+    def _shade(self, receivers, received: tuple[wp.array, wp.array]) -> None:
+        scene, device = self._device_scene, self._device
+        with self._timed("shadow fields"):
+            shade_direct(receivers, scene, self._occlusion, self._lighting, *received, device)
+        with self._timed("shadow rays"):
+            casts, eye = self._occlusion.table.occluders.casts, self._lighting.table.eye
+            add_delta_lights(receivers, scene, casts, eye, self._delta_lights, *received, device)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        wp.synchronize_device(self._device)
+        self._stage_seconds[stage] = time.perf_counter() - start
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("the renderer is closed; make a new one")
+
+
+def _check_options(height: int, width: int, order: int, shading: str, exposure: float, view: str) -> None:
+    for name, size in (("height", height), ("width", width)):
+        if int(size) != size or size < 1:
+            raise ValueError(f"{name} is {size}; give a whole number of pixels, at least 1")
+    if height * width > MOST_PIXELS:
+        raise ValueError(f"a picture of {width} x {height} pixels is too large; give at most {MOST_PIXELS} pixels")
+    if order not in ORDERS:
+        raise ValueError(f"order is {order}; choose one of {', '.join(map(str, ORDERS))}")
+    if shading not in SHADINGS:
+        raise ValueError(f"shading is {shading!r}; choose {' or '.join(map(repr, SHADINGS))}")
+    if view not in VIEWS:
+        raise ValueError(f"view is {view!r}; choose {' or '.join(map(repr, VIEWS))}")
+    if not np.isfinite(exposure):
+        raise ValueError(f"exposure is {exposure}; give a finite number of stops")

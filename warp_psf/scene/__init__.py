@@ -1,0 +1,1 @@
+"""What is rendered: shapes, materials, lights, cameras and poses, as plain data."""

@@ -1,0 +1,105 @@
+"""The scene on the device: merged meshes with their ray-query trees, materials, and the poses of a frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.scene import Poses, Scene
+
+
+@wp.struct
+class GeometryTable:
+    """What does not change from frame to frame. The meshes' arrays stand behind one another."""
+
+    mesh_id: wp.array(dtype=wp.uint64)  # (mesh), for wp.mesh_query_ray
+    first_vertex: wp.array(dtype=wp.int32)  # (mesh)
+    first_face: wp.array(dtype=wp.int32)  # (mesh)
+    normals: wp.array(dtype=wp.vec3)  # (vertex), in the mesh's frame
+    vertices: wp.array(dtype=wp.vec3)  # (vertex), metres, in the mesh's frame
+    faces: wp.array(dtype=wp.vec3i)  # (face), counted from the mesh's first vertex
+    entity_mesh: wp.array(dtype=wp.int32)  # (entity)
+    center: wp.array(dtype=wp.vec3)  # (entity): centre of the bounding sphere, in the entity's frame
+    radius: wp.array(dtype=wp.float32)  # (entity): of the bounding sphere, metres
+    convex: wp.array(dtype=wp.bool)  # (entity)
+    albedo: wp.array(dtype=wp.vec3)  # (entity)
+    specular: wp.array(dtype=wp.vec3)  # (entity)
+    exponent: wp.array(dtype=wp.float32)  # (entity)
+    emission: wp.array(dtype=wp.vec3)  # (entity)
+    object_id: wp.array(dtype=wp.int32)  # (entity)
+    object_type: wp.array(dtype=wp.int32)  # (entity)
+
+
+@wp.struct
+class PoseTable:
+    """Where the entities are."""
+
+    position: wp.array2d(dtype=wp.vec3)  # (world, entity), metres
+    rotation: wp.array2d(dtype=wp.mat33)  # (world, entity), world_from_entity
+
+
+@dataclass(frozen=True)
+class DeviceScene:
+    """The scene's tables, and the Warp meshes that must live as long as `geometry` names them."""
+
+    geometry: GeometryTable
+    poses: PoseTable
+    meshes: tuple[wp.Mesh, ...]
+    vertex_count: int
+
+
+def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
+    """Puts a scene's meshes and materials on the device, with room for the poses of `worlds` simulations."""
+    meshes = tuple(
+        wp.Mesh(
+            points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+            indices=wp.array(mesh.faces.reshape(-1), dtype=wp.int32, device=device),
+        )
+        for mesh in scene.meshes
+    )
+    table = GeometryTable()
+    table.mesh_id = wp.array([mesh.id for mesh in meshes], dtype=wp.uint64, device=device)
+    table.first_vertex = wp.array(_starts(mesh.vertices for mesh in scene.meshes), dtype=wp.int32, device=device)
+    table.first_face = wp.array(_starts(mesh.faces for mesh in scene.meshes), dtype=wp.int32, device=device)
+    table.vertices = wp.array(_merged(mesh.vertices for mesh in scene.meshes), dtype=wp.vec3, device=device)
+    table.normals = wp.array(_merged(mesh.normals for mesh in scene.meshes), dtype=wp.vec3, device=device)
+    faces = _merged((mesh.faces for mesh in scene.meshes), np.int32)
+    table.faces = wp.array(faces, dtype=wp.vec3i, device=device)
+
+    shapes: list[Mesh] = [scene.meshes[entity.mesh] for entity in scene.entities]
+    materials = [entity.material for entity in scene.entities]
+
+    def per_entity(values: list, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=device)
+
+    table.entity_mesh = per_entity([entity.mesh for entity in scene.entities], wp.int32)
+    table.center = per_entity([wp.vec3(*map(float, mesh.center)) for mesh in shapes], wp.vec3)
+    table.radius = per_entity([mesh.radius for mesh in shapes], wp.float32)
+    table.convex = per_entity([mesh.convex for mesh in shapes], wp.bool)
+    table.albedo = per_entity([wp.vec3(*map(float, material.albedo)) for material in materials], wp.vec3)
+    table.specular = per_entity([wp.vec3(*map(float, material.specular)) for material in materials], wp.vec3)
+    table.exponent = per_entity([float(material.exponent) for material in materials], wp.float32)
+    table.emission = per_entity([wp.vec3(*map(float, material.emission)) for material in materials], wp.vec3)
+    table.object_id = per_entity([entity.object_id for entity in scene.entities], wp.int32)
+    table.object_type = per_entity([entity.object_type for entity in scene.entities], wp.int32)
+
+    poses = PoseTable()
+    poses.position = wp.zeros((worlds, len(scene.entities)), dtype=wp.vec3, device=device)
+    poses.rotation = wp.zeros((worlds, len(scene.entities)), dtype=wp.mat33, device=device)
+    return DeviceScene(table, poses, meshes, sum(len(mesh.vertices) for mesh in scene.meshes))
+
+
+def write_poses(device_scene: DeviceScene, poses: Poses) -> None:
+    """Brings the poses of a frame to the device."""
+    device_scene.poses.position.assign(poses.position)
+    device_scene.poses.rotation.assign(poses.rotation)
+
+
+def _starts(arrays) -> np.ndarray:
+    counts = np.array([len(array) for array in arrays], np.int64)
+    return np.cumsum(counts) - counts
+
+
+def _merged(arrays, dtype: type = np.float32) -> np.ndarray:
+    return np.concatenate([np.zeros((0, 3), dtype), *arrays]).astype(dtype)

@@ -1,0 +1,213 @@
+"""Lights: meshes that shine, and the lights without an extent that MJCF describes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.primitives import plane
+
+if TYPE_CHECKING:
+    from warp_psf.scene.scene import Scene
+
+# R R^T may differ from the identity by this much: float32 matrices and printed decimals pass, a skewed one does not.
+ORTHONORMAL_TOLERANCE = 1e-4
+# Shorter than this (metres) a direction to a target, or a side of a rectangle, has no usable length.
+SHORTEST_LENGTH = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class AreaLight:
+    """A mesh that shines with the same radiance in every direction from the front of every face.
+
+    name: what messages call it.
+    mesh: its shape, in the light's own frame.
+    radiance: linear Rec.709, 3 values >= 0.
+    position: of the light's frame in its parent's, metres, float64 [3].
+    rotation: parent_from_light rotation matrix, float64 [3, 3].
+    body: name of the MuJoCo body that is the parent, so that the light moves with the simulation; None is the world.
+
+    Raises:
+        ValueError: a value is NaN, negative or of another shape, or `rotation` is not a rotation.
+    """
+
+    name: str
+    mesh: Mesh
+    radiance: np.ndarray
+    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    body: str | None = None
+
+    def __post_init__(self) -> None:
+        owner = f"light {self.name!r}"
+        object.__setattr__(self, "radiance", _color(self.radiance, owner, "radiance"))
+        object.__setattr__(self, "position", _numbers(self.position, (3,), owner, "position"))
+        object.__setattr__(self, "rotation", _rotation(self.rotation, owner))
+
+
+@dataclass(frozen=True, eq=False)
+class DeltaLight:
+    """A light as MJCF describes it: directional, spot or point, or MuJoCo's headlight.
+
+    The colours have MuJoCo's classic meaning: a white Lambert surface that faces the light has the colour `diffuse`.
+    A light that reaches a receiver unhindered therefore causes, per unit of the cosine, the irradiance
+
+        pi * diffuse * spot / (attenuation[0] + attenuation[1] d + attenuation[2] d^2),
+
+    where d is the distance in metres and spot = cos(angle to `direction`)^exponent within `cutoff`, 0 outside it.
+    A directional light has neither factor, a point light no spot factor. Beyond `range` spot and point lights end.
+
+    name: what messages call it.
+    kind: which of the three.
+    position, direction: in the world, metres and a unit vector that points away from the light, float64 [3]. What a
+        scene holds is the pose in the model's initial state; `bridge.read_delta_lights` brings that of a frame.
+    diffuse, specular: what lights the Lambert part and the Phong lobe, linear, 3 values >= 0.
+    ambient: added to every surface as ambient * albedo, linear, 3 values >= 0.
+    attenuation: constant, linear (1/m) and quadratic (1/m^2) coefficients, 3 values >= 0.
+    cutoff: half-angle of a spot's cone, radians.
+    exponent: how fast a spot fades towards its rim.
+    range: metres.
+    radius: of the bulb (MJCF `bulbradius`), metres: wider ones cast softer shadows.
+    castshadow: False lets its light through everything.
+    index: MuJoCo's id of the light, -1 for the headlight, which sits at the camera and looks where that looks;
+        None stays where it is.
+
+    Raises:
+        ValueError: a value is NaN, negative or of another shape, or `direction` has no length.
+    """
+
+    name: str
+    kind: Literal["directional", "spot", "point"]
+    position: np.ndarray
+    direction: np.ndarray
+    diffuse: np.ndarray
+    specular: np.ndarray
+    ambient: np.ndarray
+    attenuation: np.ndarray = field(default_factory=lambda: np.array((1.0, 0.0, 0.0)))
+    cutoff: float = np.pi
+    exponent: float = 0.0
+    range: float = np.inf
+    radius: float = 0.0
+    castshadow: bool = True
+    index: int | None = None
+
+    def __post_init__(self) -> None:
+        owner = f"light {self.name!r}"
+        if self.kind not in ("directional", "spot", "point"):
+            raise ValueError(f"{owner}: kind {self.kind!r} is unknown; choose directional, spot or point")
+        for part in ("diffuse", "specular", "ambient", "attenuation"):
+            object.__setattr__(self, part, _color(getattr(self, part), owner, part))
+        object.__setattr__(self, "position", _numbers(self.position, (3,), owner, "position"))
+        object.__setattr__(self, "direction", _unit(self.direction, owner, "direction"))
+        for part in ("cutoff", "exponent", "range", "radius"):
+            value = float(getattr(self, part))
+            if not value >= 0.0:
+                raise ValueError(f"{owner}: {part} is {value}; give a number of at least 0")
+            object.__setattr__(self, part, value)
+
+
+Light: TypeAlias = AreaLight | DeltaLight
+
+
+def rectangle_light(
+    name: str,
+    width: float,
+    height: float,
+    radiance,
+    position,
+    target=None,
+    *,
+    rotation=None,
+    body: str | None = None,
+) -> AreaLight:
+    """A flat rectangle that shines along its own +z, turned towards `target` or as `rotation` says.
+
+    Args:
+        width, height: its sides along its own x and y, metres.
+        radiance: linear Rec.709, 3 values.
+        position: of its centre in the parent's frame, metres, [3].
+        target: the point of the parent's frame it faces, [3]; its x axis then lies level, across the parent's z.
+        rotation: parent_from_light, [3, 3]; without either the light faces the parent's +z.
+        body: the parent, as in `AreaLight`.
+
+    Raises:
+        ValueError: a side is not positive, both `target` and `rotation` are given, or `target` is `position`.
+    """
+    owner = f"light {name!r}"
+    for side, value in (("width", width), ("height", height)):
+        if not SHORTEST_LENGTH < value < np.inf:
+            raise ValueError(f"{owner}: {side} is {value}; give a positive number of metres")
+    if target is not None and rotation is not None:
+        raise ValueError(f"{owner}: both target and rotation are given; give one of them")
+    position = _numbers(position, (3,), owner, "position")
+    if target is not None:
+        rotation = _facing(_numbers(target, (3,), owner, "target") - position, owner)
+    elif rotation is None:
+        rotation = np.eye(3)
+    return AreaLight(name, plane(width / 2.0, height / 2.0, cells=1), radiance, position, rotation, body)
+
+
+def area_light_entities(scene: Scene) -> tuple[tuple[AreaLight, int], ...]:
+    """The area lights of a scene, each with the index of the entity that is its shining body.
+
+    Their entities are the scene's last ones, in the order in which the lights stand in `scene.lights`.
+    """
+    lights = [light for light in scene.lights if isinstance(light, AreaLight)]
+    first = len(scene.entities) - len(lights)
+    return tuple((light, first + offset) for offset, light in enumerate(lights))
+
+
+def _numbers(value, shape: tuple[int, ...], owner: str, part: str) -> np.ndarray:
+    """`value` as float64 of `shape`; raises ValueError where it is not that, or not finite."""
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{owner}: {part} is {value!r}; give {_sizes(shape)} numbers") from error
+    if numbers.shape != shape:
+        raise ValueError(f"{owner}: {part} has shape {numbers.shape}; give {_sizes(shape)} numbers")
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{owner}: {part} is {numbers.tolist()}; every number must be finite")
+    return numbers
+
+
+def _sizes(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(size) for size in shape)
+
+
+def _color(value, owner: str, part: str) -> np.ndarray:
+    numbers = _numbers(value, (3,), owner, part)
+    if (numbers < 0.0).any():
+        raise ValueError(f"{owner}: {part} is {numbers.tolist()}; no value may be negative")
+    return numbers
+
+
+def _unit(value, owner: str, part: str) -> np.ndarray:
+    vector = _numbers(value, (3,), owner, part)
+    length = np.linalg.norm(vector)
+    if length < SHORTEST_LENGTH:
+        raise ValueError(f"{owner}: {part} is {vector.tolist()}, which has no length; give one that points somewhere")
+    return vector / length
+
+
+def _rotation(value, owner: str) -> np.ndarray:
+    rotation = _numbers(value, (3, 3), owner, "rotation")
+    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if skew > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        raise ValueError(
+            f"{owner}: rotation is not a rotation matrix (R R^T differs from 1 by {skew:.2g}, determinant "
+            f"{np.linalg.det(rotation):.3g}); give three unit columns at right angles, right-handed"
+        )
+    return rotation
+
+
+def _facing(direction: np.ndarray, owner: str) -> np.ndarray:
+    """The rotation whose +z is `direction` and whose x axis lies level."""
+    z = _unit(direction, owner, "direction from position to target")
+    x = np.cross((0.0, 0.0, 1.0), z)
+    length = np.linalg.norm(x)
+    # Straight up or down every x axis is level: keep the parent's.
+    x = x / length if length > SHORTEST_LENGTH else np.array((1.0, 0.0, 0.0))
+    return np.stack((x, np.cross(z, x), z), axis=1)

@@ -1,0 +1,211 @@
+"""Lights without an extent, as MJCF has them: directional, spot and point, with traced shadow rays."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_psf.device import launch
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.light import DeltaLight
+from warp_psf.scene.receiver import ReceiverTable
+
+# Shadow rays towards a bulb with a radius. When the first few, spread over the bulb, agree, the rest are left out.
+BULB_RAYS = 48
+FIRST_BULB_RAYS = 12
+# A shadow ray starts this share of the bounding radius off a body that can shadow itself: its smooth normals lift
+# receivers off the flat faces that the ray would meet.
+SHADOW_OFFSET = 2.0e-3
+KINDS = {"directional": 0, "spot": 1, "point": 2}
+
+
+@wp.struct
+class DeltaLightTable:
+    """Arrays (world, light)."""
+
+    kind: wp.array2d(dtype=wp.int32)
+    position: wp.array2d(dtype=wp.vec3)  # metres
+    direction: wp.array2d(dtype=wp.vec3)  # away from the light
+    diffuse: wp.array2d(dtype=wp.vec3)
+    specular: wp.array2d(dtype=wp.vec3)
+    ambient: wp.array2d(dtype=wp.vec3)
+    attenuation: wp.array2d(dtype=wp.vec3)
+    spot: wp.array2d(dtype=wp.vec2)  # cos(cutoff), exponent
+    reach: wp.array2d(dtype=wp.float32)  # metres
+    radius: wp.array2d(dtype=wp.float32)  # of the bulb, metres
+    casts: wp.array2d(dtype=wp.bool)
+
+
+@wp.func
+def is_blocked(
+    world: int, own: int, p: wp.vec3, toward: wp.vec3, geometry: GeometryTable, poses: PoseTable, casts: wp.array(dtype=wp.bool)
+) -> bool:
+    """Whether anything stands on the segment from p to p + toward. A convex body does not shadow itself."""
+    length_squared = wp.dot(toward, toward)
+    for entity in range(geometry.entity_mesh.shape[0]):
+        if casts[entity] and not (entity == own and geometry.convex[entity]):
+            position = poses.position[world, entity]
+            rotation = poses.rotation[world, entity]
+            radius = geometry.radius[entity]
+            to_center = position + rotation * geometry.center[entity] - p
+            # The point of the segment that is nearest to the centre.
+            nearest = wp.clamp(wp.dot(to_center, toward) / length_squared, 0.0, 1.0)
+            if wp.length_sq(to_center - nearest * toward) < radius * radius:
+                inverse = wp.transpose(rotation)
+                if wp.mesh_query_ray_anyhit(
+                    geometry.mesh_id[geometry.entity_mesh[entity]],
+                    inverse * (p - position),
+                    inverse * toward,
+                    1.0,
+                ):
+                    return True
+    return False
+
+
+@wp.func
+def bulb_point(ray: int, count: int) -> wp.vec2:
+    """Places on the unit disc, spread evenly and in an order in which any first few are spread too."""
+    turned = wp.frac(float(ray) * 0.61803399)
+    radius = wp.sqrt((float(ray) + 0.5) / float(count))
+    return wp.vec2(radius * wp.cos(6.2831853 * turned), radius * wp.sin(6.2831853 * turned))
+
+
+@wp.kernel(module="unique")
+def _add_delta_lights(
+    first: int,
+    receivers: ReceiverTable,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    casts: wp.array(dtype=wp.bool),  # (entity)
+    eye: wp.array(dtype=wp.vec3),  # (world)
+    lights: DeltaLightTable,
+    far: float,
+    diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, receiver), added to
+    glossy_out: wp.array2d(dtype=wp.vec3),  # (world, receiver), added to
+):
+    world, receiver = wp.tid()
+    receiver += first
+    entity = receivers.entity[world, receiver]
+    if entity < 0:
+        return
+    n = receivers.normal[world, receiver]
+    p = receivers.position[world, receiver]
+    origin = p
+    if not geometry.convex[entity]:
+        origin = p + (wp.static(SHADOW_OFFSET) * geometry.radius[entity]) * n
+    exponent = geometry.exponent[entity]
+    view = wp.normalize(eye[world] - p)
+    mirrored = 2.0 * wp.dot(n, view) * n - view
+    diffuse = wp.vec3()
+    glossy = wp.vec3()
+    for light in range(lights.kind.shape[1]):
+        diffuse += wp.static(math.pi) * lights.ambient[world, light]
+        kind = lights.kind[world, light]
+        toward = -far * lights.direction[world, light]
+        strength = float(1.0)
+        if kind != wp.static(KINDS["directional"]):
+            toward = lights.position[world, light] - p
+            distance = wp.length(toward)
+            a = lights.attenuation[world, light]
+            strength = wp.where(distance < lights.reach[world, light], 1.0, 0.0)
+            strength /= wp.max(a[0] + a[1] * distance + a[2] * distance * distance, 1.0e-6)
+            if kind == wp.static(KINDS["spot"]):
+                along = -wp.dot(toward, lights.direction[world, light]) / wp.max(distance, 1.0e-9)
+                cone = lights.spot[world, light]
+                strength *= wp.where(along > cone[0], wp.pow(wp.max(along, 0.0), cone[1]), 0.0)
+        unit = wp.normalize(toward)
+        cosine = wp.dot(n, unit)
+        if cosine > 0.0 and strength > 0.0:
+            lit = float(1.0)
+            if lights.casts[world, light]:
+                radius = lights.radius[world, light]
+                if radius > 0.0 and kind != wp.static(KINDS["directional"]):
+                    # A disc that faces the receiver stands for the bulb.
+                    across = wp.normalize(wp.cross(unit, wp.where(wp.abs(unit[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))))
+                    up = wp.cross(unit, across)
+                    open_rays = int(0)
+                    cast = int(0)
+                    rays = int(wp.static(BULB_RAYS))
+                    for ray in range(rays):
+                        # Steps of 29 through 48 visit every place once, and any twelve in a row are spread out.
+                        place = bulb_point((ray * 29) % wp.static(BULB_RAYS), wp.static(BULB_RAYS))
+                        decided = ray >= wp.static(FIRST_BULB_RAYS) and (open_rays == 0 or open_rays == cast)
+                        if not decided:
+                            aimed = toward + radius * (place[0] * across + place[1] * up)
+                            cast += 1
+                            if not is_blocked(world, entity, origin, aimed, geometry, poses, casts):
+                                open_rays += 1
+                    lit = float(open_rays) / float(cast)
+                elif is_blocked(world, entity, origin, toward, geometry, poses, casts):
+                    lit = 0.0
+            diffuse += (wp.static(math.pi) * strength * lit * cosine) * lights.diffuse[world, light]
+            lobe = wp.static(0.5) * (exponent + 2.0) * wp.pow(wp.max(wp.dot(mirrored, unit), 0.0), exponent)
+            glossy += (strength * lit * lobe) * lights.specular[world, light]
+    diffuse_out[world, receiver] = diffuse_out[world, receiver] + diffuse
+    glossy_out[world, receiver] = glossy_out[world, receiver] + glossy
+
+
+@dataclass(frozen=True)
+class DeltaState:
+    """Room on the device for the delta lights of a scene."""
+
+    table: DeltaLightTable
+    far: float  # metres: how far a directional light's shadow rays reach
+
+
+def make_delta_lights(count: int, worlds: int, far: float, device: wp.Device) -> DeltaState:
+    """Room for at most `count` delta lights in each of `worlds` worlds."""
+    table = DeltaLightTable()
+    shape = (worlds, count)
+    table.kind = wp.zeros(shape, dtype=wp.int32, device=device)
+    for name in ("position", "direction", "diffuse", "specular", "ambient", "attenuation"):
+        setattr(table, name, wp.zeros(shape, dtype=wp.vec3, device=device))
+    table.spot = wp.zeros(shape, dtype=wp.vec2, device=device)
+    table.reach = wp.zeros(shape, dtype=wp.float32, device=device)
+    table.radius = wp.zeros(shape, dtype=wp.float32, device=device)
+    table.casts = wp.zeros(shape, dtype=wp.bool, device=device)
+    return DeltaState(table, far)
+
+
+def write_delta_lights(state: DeltaState, worlds: Sequence[Sequence[DeltaLight]]) -> None:
+    """Brings this frame's lights to the device; places beyond a world's last light stay dark."""
+    table = state.table
+    count = table.kind.shape[1]
+
+    def collect(value, filler) -> np.ndarray:
+        return np.array(
+            [[value(light) for light in lights] + [filler] * (count - len(lights)) for lights in worlds]
+        )
+
+    dark = np.zeros(3)
+    table.kind.assign(collect(lambda light: KINDS[light.kind], 0).astype(np.int32))
+    table.position.assign(collect(lambda light: light.position, dark).astype(np.float32))
+    table.direction.assign(collect(lambda light: light.direction, np.array([0, 0, -1.0])).astype(np.float32))
+    table.diffuse.assign(collect(lambda light: light.diffuse, dark).astype(np.float32))
+    table.specular.assign(collect(lambda light: light.specular, dark).astype(np.float32))
+    table.ambient.assign(collect(lambda light: light.ambient, dark).astype(np.float32))
+    table.attenuation.assign(collect(lambda light: light.attenuation, np.array([1.0, 0, 0])).astype(np.float32))
+    table.spot.assign(collect(lambda light: (math.cos(light.cutoff), light.exponent), (1.0, 0.0)).astype(np.float32))
+    # float32 has no room for every float64 range.
+    table.reach.assign(np.minimum(collect(lambda light: light.range, 0.0), 1e30).astype(np.float32))
+    table.radius.assign(collect(lambda light: light.radius, 0.0).astype(np.float32))
+    table.casts.assign(collect(lambda light: light.castshadow, False).astype(bool))
+
+
+def add_delta_lights(
+    receivers: ReceiverTable,
+    scene: DeviceScene,
+    casts: wp.array,
+    eye: wp.array,
+    lights: DeltaState,
+    diffuse: wp.array,
+    glossy: wp.array,
+    device: wp.Device,
+) -> None:
+    """Adds the delta lights to every receiver's irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, slot)."""
+    if lights.table.kind.shape[1] == 0:
+        return
+    inputs = [receivers, scene.geometry, scene.poses, casts, eye, lights.table, lights.far]
+    launch(_add_delta_lights, diffuse.shape, inputs, [diffuse, glossy], device)

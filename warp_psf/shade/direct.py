@@ -1,0 +1,261 @@
+"""Direct light: the integral over directions of light, visibility and reflectance (Tamura 2006, Figure 3)."""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis import sh, sphere
+from warp_psf.device import launch
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.coverage import basis_at_directions
+from warp_psf.shade.occlude import OcclusionState, make_occlude
+
+# Sums over directions may be taken in any order, which lets a CPU add sixteen at a time; the order is fixed by the
+# compiled code, so equal input still gives equal bits.
+FAST_SUMS = f"{wp.config.cpu_compiler_flags} -mreassociate -fno-signed-zeros"
+
+
+@cache
+def make_direct(order: int) -> SimpleNamespace:
+    """The kernel and tables of direct light on `order` bands."""
+    kit = make_occlude(order)
+    vec, values = kit.vec, kit.values
+    Occlusion = kit.Occlusion
+    # The closed forms of the transfer are not stored, so they may have a band more than the fields: the clamped
+    # cosine's last large coefficient is that of l = 4. The quadrature is exact for it.
+    cosine_lobe = [float(c) for c in lobe_polynomial(sh.clamped_cosine(order + 1))]
+    hemisphere = [float(c) for c in lobe_polynomial(sh.cap(np.pi / 2, order))]
+    lobe_degree = len(cosine_lobe) - 1
+    hemisphere_degree = len(hemisphere) - 1
+
+    @wp.struct
+    class Lighting:
+        """Lights and what receives them."""
+
+        environment: wp.array2d(dtype=values)  # (world, channel): radiance times quadrature weight
+        light_entity: wp.array(dtype=wp.int32)  # (area light)
+        light_radiance: wp.array2d(dtype=wp.vec3)  # (world, area light)
+        light_facing: wp.array(dtype=wp.vec3)  # (area light): front of a flat one in its frame, else zero
+        eye: wp.array(dtype=wp.vec3)  # (world), metres
+        transfer: wp.array(dtype=vec)  # (transfer vertex), in the entity's frame
+        self_visibility: wp.array(dtype=vec)  # (transfer vertex)
+        first_transfer: wp.array(dtype=wp.int32)  # (entity): -1 for convex bodies
+        lobe: wp.array2d(dtype=wp.float32)  # (entity, power): Phong lobe as a polynomial of the cosine
+
+    @wp.func
+    def interpolate(
+        stored: wp.array(dtype=vec), start: int, corners: wp.vec3i, uv: wp.vec2, rows: wp.array(dtype=values)
+    ) -> values:
+        return kit.at_directions(
+            uv[0] * stored[start + corners[0]]
+            + uv[1] * stored[start + corners[1]]
+            + (1.0 - uv[0] - uv[1]) * stored[start + corners[2]],
+            rows,
+        )
+
+    @wp.func
+    def clamped_cosine(cosine: values) -> values:
+        total = values(wp.static(cosine_lobe[lobe_degree]))
+        for k in range(wp.static(lobe_degree)):
+            total = wp.cw_mul(total, cosine) + values(wp.static(cosine_lobe[lobe_degree - 1 - k]))
+        return total
+
+    @wp.func
+    def upper_half(cosine: values) -> values:
+        total = values(wp.static(hemisphere[hemisphere_degree]))
+        for k in range(wp.static(hemisphere_degree)):
+            total = wp.cw_mul(total, cosine) + values(wp.static(hemisphere[hemisphere_degree - 1 - k]))
+        return total
+
+    @wp.func
+    def phong(cosine: values, entity: int, lobe: wp.array2d(dtype=wp.float32)) -> values:
+        total = values(lobe[entity, wp.static(lobe_degree)])
+        for k in range(wp.static(lobe_degree)):
+            total = wp.cw_mul(total, cosine) + values(lobe[entity, wp.static(lobe_degree) - 1 - k])
+        return total
+
+    @wp.kernel(module="unique", module_options={"cpu_compiler_flags": FAST_SUMS})
+    def shade_receivers(
+        first: int,
+        receivers: ReceiverTable,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+        lighting: Lighting,
+        diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, receiver): irradiance
+        glossy_out: wp.array2d(dtype=wp.vec3),  # (world, receiver): radiance through the normalised Phong lobe
+    ):
+        world, receiver = wp.tid()
+        receiver += first
+        entity = receivers.entity[world, receiver]
+        if entity < 0:
+            return
+        p = receivers.position[world, receiver]
+        n = receivers.normal[world, receiver]
+        rows = o.rows[world, entity]
+        own_cosine = kit.cosine_to(n, o.quadrature)
+        start = lighting.first_transfer[entity]
+        mesh = geometry.entity_mesh[entity]
+        corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, receiver]]
+        uv = receivers.uv[world, receiver]
+        transfer = values()
+        if start >= 0:
+            transfer = interpolate(lighting.transfer, start, corners, uv, rows)
+        else:
+            transfer = clamped_cosine(own_cosine)
+
+        glossy = wp.max(geometry.specular[entity]) > 0.0
+        lobe = values()
+        if glossy:
+            view = wp.normalize(lighting.eye[world] - p)
+            mirrored = 2.0 * wp.dot(n, view) * n - view
+            lobe = phong(kit.cosine_to(mirrored, o.quadrature), entity, lighting.lobe)
+            if start >= 0:
+                lobe = wp.cw_mul(lobe, interpolate(lighting.self_visibility, start, corners, uv, rows))
+            else:
+                lobe = wp.cw_mul(lobe, upper_half(own_cosine))
+
+        visible = kit.visibility_at(world, entity, p, n, geometry, poses, o)
+        received = wp.cw_mul(visible, transfer)
+        diffuse = wp.vec3(
+            wp.dot(lighting.environment[world, 0], received),
+            wp.dot(lighting.environment[world, 1], received),
+            wp.dot(lighting.environment[world, 2], received),
+        )
+        reflected = wp.vec3()
+        if glossy:
+            received = wp.cw_mul(visible, lobe)
+            reflected = wp.vec3(
+                wp.dot(lighting.environment[world, 0], received),
+                wp.dot(lighting.environment[world, 1], received),
+                wp.dot(lighting.environment[world, 2], received),
+            )
+
+        for light in range(lighting.light_entity.shape[0]):
+            shining = lighting.light_entity[light]
+            rotation = poses.rotation[world, shining]
+            position = poses.position[world, shining]
+            center = position + rotation * geometry.center[shining]
+            facing = rotation * lighting.light_facing[light]
+            lit = wp.dot(n, center - p) > -geometry.radius[shining] and shining != entity
+            if wp.length_sq(facing) > 0.0:
+                lit = lit and wp.dot(facing, p - center) > 0.0
+            if lit:
+                seen = kit.coverage_of(
+                    shining,
+                    p,
+                    position,
+                    rotation,
+                    geometry.center[shining],
+                    geometry.radius[shining],
+                    o.occluders,
+                    o.fields,
+                    o.rows[world, shining],
+                    o.quadrature,
+                )
+                visible = kit.visibility_before(world, entity, shining, p, n, geometry, poses, o)
+                weighted = wp.cw_mul(wp.cw_mul(seen, visible), o.quadrature[3])
+                radiance = lighting.light_radiance[world, light]
+                # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
+                diffuse += wp.max(wp.dot(weighted, transfer), 0.0) * radiance
+                if glossy:
+                    reflected += wp.max(wp.dot(weighted, lobe), 0.0) * radiance
+
+        zero = wp.vec3()
+        diffuse_out[world, receiver] = wp.max(diffuse, zero)
+        glossy_out[world, receiver] = wp.max(reflected, zero)
+
+    return SimpleNamespace(**vars(kit), Lighting=Lighting, shade_receivers=shade_receivers)
+
+
+def lobe_polynomial(profile: np.ndarray) -> np.ndarray:
+    """Ascending coefficients, in the cosine to the axis, of a zonal function with the profile f_l, float64 [order]."""
+    bands = np.arange(len(profile))
+    return np.polynomial.legendre.leg2poly(profile * np.sqrt((2 * bands + 1) / (4 * np.pi)))
+
+
+@dataclass(frozen=True)
+class DirectState:
+    """The lighting tables of a scene."""
+
+    order: int
+    table: Any  # make_direct(order).Lighting
+
+
+def upload_lighting(
+    scene: Scene,
+    transfers: list[tuple[np.ndarray, np.ndarray] | None],
+    lights: list[tuple[int, np.ndarray]],
+    order: int,
+    worlds: int,
+    device: wp.Device,
+) -> DirectState:
+    """The lighting tables of a scene.
+
+    transfers: per mesh its (transfer, self-visibility), float32 [vertices, order^2] each, or None if it is convex.
+    lights: (entity, radiance [3]) of each area light.
+    """
+    kit = make_direct(order)
+    table = kit.Lighting()
+    table.environment = wp.zeros((worlds, 3), dtype=kit.values, device=device)
+    table.light_entity = wp.array([entity for entity, _ in lights], dtype=wp.int32, device=device)
+    radiance = np.array([radiance for _, radiance in lights], np.float32).reshape(1, -1, 3)
+    table.light_radiance = wp.array(np.repeat(radiance, worlds, axis=0), dtype=wp.vec3, device=device)
+    facing = [_facing_of(scene.meshes[scene.entities[entity].mesh]) for entity, _ in lights]
+    table.light_facing = wp.array(np.array(facing, np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)
+    table.eye = wp.zeros(worlds, dtype=wp.vec3, device=device)
+
+    stored = [pair for pair in transfers if pair is not None]
+    empty = np.zeros((0, order * order), np.float32)
+    table.transfer = wp.array(np.concatenate([empty, *(p[0] for p in stored)]), dtype=kit.vec, device=device)
+    table.self_visibility = wp.array(np.concatenate([empty, *(p[1] for p in stored)]), dtype=kit.vec, device=device)
+    starts, total = [], 0
+    for pair in transfers:
+        starts.append(-1 if pair is None else total)
+        total += 0 if pair is None else len(pair[0])
+    first = [starts[entity.mesh] for entity in scene.entities]
+    table.first_transfer = wp.array(first, dtype=wp.int32, device=device)
+    lobes = [lobe_polynomial(sh.phong_lobe(entity.material.exponent, order + 1)) for entity in scene.entities]
+    table.lobe = wp.array(np.array(lobes, np.float32).reshape(-1, order + 1), dtype=wp.float32, ndim=2, device=device)
+    return DirectState(order, table)
+
+
+def write_environment(state: DirectState, coefficients: np.ndarray) -> None:
+    """Sets the environment of every world: radiance on SH, float64 [order^2, 3]."""
+    order = state.order
+    values = basis_at_directions(order) @ coefficients
+    weighted = sphere.quadrature(sphere.QUADRATURE_POINTS[order])[1][:, None] * values
+    worlds = state.table.environment.shape[0]
+    state.table.environment.assign(np.repeat(weighted.T.astype(np.float32)[None], worlds, axis=0))
+
+
+def shade_direct(
+    receivers: ReceiverTable,
+    scene: DeviceScene,
+    occlusion: OcclusionState,
+    lighting: DirectState,
+    diffuse: wp.array,
+    glossy: wp.array,
+    device: wp.Device,
+) -> None:
+    """Writes every receiver's irradiance (W/m^2 in the light's units) and its radiance through the Phong lobe.
+
+    diffuse, glossy: vec3 (worlds, receivers). Empty slots keep what they held.
+    """
+    kit = make_direct(lighting.order)
+    inputs = [receivers, scene.geometry, scene.poses, occlusion.table, lighting.table]
+    launch(kit.shade_receivers, diffuse.shape, inputs, [diffuse, glossy], device)
+
+
+def _facing_of(mesh: Mesh) -> np.ndarray:
+    """The side to which a flat open mesh shines; zero for others."""
+    if mesh.slab is None or mesh.slab[2].min() > 0:
+        return np.zeros(3)
+    return mesh.normals.mean(axis=0)

@@ -1,0 +1,260 @@
+"""Composing occluders: the visibility that the bodies around a receiver leave, at the directions of a quadrature."""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis import sh, sphere
+from warp_psf.device import launch
+from warp_psf.field.shells import ShadowField, upload_fields
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.coverage import (
+    FIELD_SHAPE,
+    NO_SHAPE,
+    SLAB_SHAPE,
+    SPHERE_SHAPE,
+    make_coverage,
+    quadrature_rows,
+)
+
+# An occluder whose bounding sphere could take less than this share of a diffuse receiver's light is left out.
+# Seen face-on a sphere of radius R at distance d takes (R/d)^2; a two-hundredth of an 8-bit step per occluder.
+SMALLEST_SHARE = 1.0e-3
+# A slab whose corners rise above the receiver's tangent plane by less than this share of its half-diagonal counts as
+# below it: the floor beside a receiver on the same floor.
+SLAB_HORIZON = 1.0e-5
+
+
+@cache
+def make_occlude(order: int) -> SimpleNamespace:
+    """Device functions for `order` bands: `visibility_at` and `visibility_before`, and their tables."""
+    kit = make_coverage(order)
+    values = kit.values
+    OccluderTable, FieldTable = kit.OccluderTable, kit.FieldTable
+    evaluate = sh.make_sh(order).evaluate
+
+    @wp.struct
+    class Occlusion:
+        """Everything that composing occluders reads, but the poses."""
+
+        occluders: OccluderTable
+        fields: FieldTable
+        rows: wp.array3d(dtype=values)  # (world, entity, coefficient): the entity's y_k at the world's directions
+        quadrature: wp.array(dtype=values)  # x, y, z, weight of the directions
+
+    @wp.func
+    def matters(
+        entity: int, own: int, p: wp.vec3, n: wp.vec3, center: wp.vec3, radius: float, rotation: wp.mat33, o: Occlusion
+    ) -> bool:
+        """Whether an entity can take light from a receiver at p with normal n."""
+        if entity == own or not o.occluders.casts[entity]:
+            return False
+        offset = center - p
+        height = wp.dot(n, offset)
+        if height < -radius:
+            return False  # below the horizon
+        if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
+            half = o.occluders.slab_half[entity]
+            n_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity]) * n
+            rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
+            return height + rise > wp.static(SLAB_HORIZON) * radius
+        return radius * radius > wp.static(SMALLEST_SHARE) * wp.dot(offset, offset)
+
+    @wp.func
+    def visibility_at(
+        world: int, own: int, p: wp.vec3, n: wp.vec3, geometry: GeometryTable, poses: PoseTable, o: Occlusion
+    ) -> values:
+        """Visibility past every entity but `own`: the product of what each leaves."""
+        visible = values(1.0)
+        for entity in range(geometry.entity_mesh.shape[0]):
+            position = poses.position[world, entity]
+            rotation = poses.rotation[world, entity]
+            radius = geometry.radius[entity]
+            center = position + rotation * geometry.center[entity]
+            if matters(entity, own, p, n, center, radius, rotation, o):
+                covered = kit.coverage_of(
+                    entity,
+                    p,
+                    position,
+                    rotation,
+                    geometry.center[entity],
+                    radius,
+                    o.occluders,
+                    o.fields,
+                    o.rows[world, entity],
+                    o.quadrature,
+                )
+                visible = wp.cw_mul(visible, values(1.0) - covered)
+        return visible
+
+    @wp.func
+    def share_before(
+        entity: int,
+        p: wp.vec3,
+        center: wp.vec3,
+        radius: float,
+        position: wp.vec3,
+        rotation: wp.mat33,
+        light_center: wp.vec3,
+        light_radius: float,
+        o: Occlusion,
+    ) -> float:
+        """How far an occluder stands between p and a light: 1 in front of it, 0 behind or beside it."""
+        to_light = light_center - p
+        light_distance = wp.length(to_light)
+        if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
+            # A face with both the receiver and the whole light before it separates the slab from their rays.
+            to_world = rotation * o.occluders.slab_rotation[entity]
+            origin = position + rotation * o.occluders.slab_center[entity]
+            p_slab = wp.transpose(to_world) * (p - origin)
+            light_slab = wp.transpose(to_world) * (light_center - origin)
+            half = o.occluders.slab_half[entity]
+            skin = wp.static(SLAB_HORIZON) * radius
+            for axis in range(3):
+                side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
+                if (
+                    side * p_slab[axis] > half[axis] - skin
+                    and side * light_slab[axis] - light_radius > half[axis] - skin
+                ):
+                    return 0.0
+            return 1.0
+        to_center = center - p
+        distance = wp.length(to_center)
+        cosine = wp.dot(to_center, to_light) / wp.max(distance * light_distance, 1.0e-12)
+        apart = wp.acos(wp.clamp(cosine, -1.0, 1.0))
+        size = wp.asin(wp.min(radius / wp.max(distance, 1.0e-9), 1.0))
+        light_size = wp.asin(wp.min(light_radius / wp.max(light_distance, 1.0e-9), 1.0))
+        if apart > size + light_size:
+            return 0.0
+        # Fades over the overlap of both bounding spheres, so that nothing pops as a body passes the light's distance.
+        return wp.clamp(0.5 + (light_distance - distance) / wp.max(light_radius + radius, 1.0e-9), 0.0, 1.0)
+
+    @wp.func
+    def visibility_before(
+        world: int,
+        own: int,
+        light: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+    ) -> values:
+        """Visibility of the light `light` past the entities nearer than it (Zhou 2005; Tamura 2006, Figure 3)."""
+        light_center = poses.position[world, light] + poses.rotation[world, light] * geometry.center[light]
+        visible = values(1.0)
+        for entity in range(geometry.entity_mesh.shape[0]):
+            position = poses.position[world, entity]
+            rotation = poses.rotation[world, entity]
+            radius = geometry.radius[entity]
+            center = position + rotation * geometry.center[entity]
+            if matters(entity, own, p, n, center, radius, rotation, o):
+                share = share_before(
+                    entity, p, center, radius, position, rotation, light_center, geometry.radius[light], o
+                )
+                if share > 0.0:
+                    covered = kit.coverage_of(
+                        entity,
+                        p,
+                        position,
+                        rotation,
+                        geometry.center[entity],
+                        radius,
+                        o.occluders,
+                        o.fields,
+                        o.rows[world, entity],
+                        o.quadrature,
+                    )
+                    visible = wp.cw_mul(visible, values(1.0) - share * covered)
+        return visible
+
+    @wp.kernel(module="unique")
+    def turn_basis(
+        first: int,
+        poses: PoseTable,
+        directions: wp.array(dtype=wp.vec3),  # (quadrature point)
+        rows_out: wp.array4d(dtype=wp.float32),  # (world, entity, coefficient, quadrature point)
+    ):
+        world, entity = wp.tid()
+        entity += first
+        to_entity = wp.transpose(poses.rotation[world, entity])
+        for q in range(directions.shape[0]):
+            turned = evaluate(to_entity * directions[q])
+            for k in range(wp.static(order * order)):
+                rows_out[world, entity, k, q] = turned[k]
+
+    return SimpleNamespace(
+        **vars(kit),
+        Occlusion=Occlusion,
+        visibility_at=visibility_at,
+        visibility_before=visibility_before,
+        turn_basis=turn_basis,
+    )
+
+
+@dataclass(frozen=True)
+class OcclusionState:
+    """The occlusion tables of a scene, and what is needed to turn them with the poses of a frame."""
+
+    order: int
+    table: Any  # make_occlude(order).Occlusion
+    directions: wp.array
+    rows: wp.array  # (world, entity, coefficient, quadrature point): the memory behind table.rows
+
+
+def upload_occlusion(
+    scene: Scene,
+    fields: list[ShadowField | None],
+    casts: list[bool],
+    order: int,
+    worlds: int,
+    device: wp.Device,
+) -> OcclusionState:
+    """The occlusion tables of a scene.
+
+    fields: per entity its field, or None where its coverage has a closed form. Entities may share a field.
+    casts: per entity whether it casts shadows.
+    """
+    kit = make_occlude(order)
+    distinct = list({id(field): field for field in fields if field is not None}.values())
+    number = {id(field): index for index, field in enumerate(distinct)}
+    shapes = [scene.meshes[entity.mesh] for entity in scene.entities]
+    occluders = kit.OccluderTable()
+    shape = [_shape_of(mesh, field) for mesh, field in zip(shapes, fields, strict=True)]
+    occluders.shape = wp.array(shape, dtype=wp.int32, device=device)
+    occluders.casts = wp.array(casts, dtype=wp.bool, device=device)
+    occluders.field = wp.array([number.get(id(field), -1) for field in fields], dtype=wp.int32, device=device)
+    slabs = [mesh.slab or (np.zeros(3), np.eye(3), np.ones(3)) for mesh in shapes]
+    occluders.slab_center = wp.array(np.array([slab[0] for slab in slabs]), dtype=wp.vec3, device=device)
+    occluders.slab_rotation = wp.array(np.array([slab[1] for slab in slabs]), dtype=wp.mat33, device=device)
+    occluders.slab_half = wp.array(np.array([slab[2] for slab in slabs]), dtype=wp.vec3, device=device)
+
+    shape_of_rows = (worlds, len(shapes), order * order)
+    rows = wp.zeros((*shape_of_rows, kit.points), dtype=wp.float32, device=device)
+    table = kit.Occlusion()
+    table.occluders = occluders
+    table.fields = upload_fields(distinct, order, device)
+    table.rows = wp.array(ptr=rows.ptr, dtype=kit.values, shape=shape_of_rows, device=device, copy=False)
+    table.quadrature = quadrature_rows(order, device)
+    directions = sphere.quadrature(kit.points)[0]
+    return OcclusionState(order, table, wp.array(directions, dtype=wp.vec3, device=device), rows)
+
+
+def turn_occlusion(state: OcclusionState, scene: DeviceScene, device: wp.Device) -> None:
+    """Turns every entity's basis with its pose; once per frame."""
+    kit = make_occlude(state.order)
+    launch(kit.turn_basis, state.rows.shape[:2], [scene.poses, state.directions], [state.rows], device)
+
+
+def _shape_of(mesh: Mesh, field: ShadowField | None) -> int:
+    if mesh.slab is not None:
+        return SLAB_SHAPE
+    if mesh.sphere is not None:
+        return SPHERE_SHAPE
+    return NO_SHAPE if field is None else FIELD_SHAPE
