@@ -20,6 +20,8 @@ from sims.surfaces import Body
 HIDDEN_GROUP = 3
 # Seconds: two steps are the shortest time constant that MuJoCo's contacts keep stable.
 TIMESTEP = 0.001
+# A satin highlight, as broad as four bands of spherical harmonics can show.
+SHININESS = 0.25
 
 
 def new_stage(position: tuple[float, float, float], target: tuple[float, float, float], fovy: float) -> mujoco.MjSpec:
@@ -40,8 +42,8 @@ def new_stage(position: tuple[float, float, float], target: tuple[float, float, 
 
 
 def add_material(spec: mujoco.MjSpec, name: str, rgb: tuple[float, float, float], gloss: float = 0.0) -> None:
-    """A material of sRGB colour `rgb`; `gloss` in [0, 1] raises the strength and the sharpness of its highlight."""
-    spec.add_material(name=name, rgba=[*rgb, 1.0], specular=gloss, shininess=gloss)
+    """A material of sRGB colour `rgb`; `gloss` in [0, 1] is the strength of its highlight."""
+    spec.add_material(name=name, rgba=[*rgb, 1.0], specular=gloss, shininess=SHININESS)
 
 
 def add_mesh(spec: mujoco.MjSpec, name: str, surface: Body) -> None:

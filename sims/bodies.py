@@ -204,9 +204,14 @@ def teapot_like(radius: float = 0.16, rings: int = 70, segments: int = 64) -> Bo
     # The mouth closes as a rounded rim.
     rim = np.sqrt(np.clip(1 - ((along - 0.97) / 0.03).clip(0) ** 2, 0.05, None))
     spout_part = tube(spout, radius * (0.3 - 0.34 * along + 0.15 * along**2) * rim, 22)
-    handle = [[-0.8, 0, 0.98], [-1.2, 0, 1.08], [-1.5, 0, 0.95], [-1.5, 0, 0.68], [-1.2, 0, 0.4], [-0.85, 0, 0.3]]
-    handle_part = tube(resample(smooth(np.array(handle)), 48) * radius, np.full(48, 0.085 * radius), 18)
+    handle_part = tube(teapot_handle_path(48, radius), np.full(48, 0.085 * radius), 18)
     return join(pot, spout_part, handle_part)
+
+
+def teapot_handle_path(count: int, radius: float = 0.16) -> np.ndarray:
+    """Points along the middle of a teapot's handle, metres [count, 3]; its ends stop inside the pot."""
+    x, z = [-0.8, -1.2, -1.5, -1.5, -1.2, -0.85], [0.98, 1.08, 0.95, 0.68, 0.4, 0.3]
+    return resample(smooth(np.stack([x, np.zeros(6), z], axis=1)), count) * radius
 
 
 def pedestal(radius: float = 0.34, height: float = 0.5, rings: int = 30, segments: int = 64) -> Body:

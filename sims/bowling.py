@@ -24,8 +24,8 @@ PIN_SLICE_SEGMENTS = 36
 # Time constant (s) and damping ratio of contacts: hard, pins spring back, the curtain at the back swallows the ball.
 LIVELY, DULL = (0.003, 0.25), (0.03, 1.6)
 # Where the ball starts, metres, and how it moves, m/s; it aims at the pocket beside the head pin.
-BALL_START = (-3.05, -0.15, BALL_DIAMETER / 2)
-BALL_SPEED, BALL_ANGLE = 3.0, math.radians(3.6)
+BALL_START = (-3.05, -0.3, BALL_DIAMETER / 2)
+BALL_SPEED, BALL_ANGLE = 3.0, math.radians(4.6)
 # Spin about the vertical, rad/s.
 BALL_SIDE_SPIN = 3.0
 
@@ -37,7 +37,7 @@ def build() -> mujoco.MjModel:
     add_material(spec, "wall", (0.33, 0.36, 0.4))
     add_material(spec, "curtain", (0.36, 0.2, 0.21))
     add_material(spec, "pin", (0.93, 0.91, 0.86), gloss=0.3)
-    add_material(spec, "ball", (0.06, 0.12, 0.34), gloss=0.7)
+    add_material(spec, "ball", (0.06, 0.12, 0.34), gloss=1.0)
     _add_lane(spec)
     add_mesh(spec, "pin", pin(rings=64, segments=54))
     for low, high in PIN_SLICES:
@@ -82,7 +82,7 @@ def _add_lane(spec: mujoco.MjSpec) -> None:
     walls = {
         "wall_left": ((-0.1, 0.85, -0.03), (1.4, 0.92, 0.34), "wall", LIVELY),
         "wall_right": ((-0.1, -0.92, -0.03), (1.4, -0.85, 0.34), "wall", LIVELY),
-        "curtain": ((1.45, -3.4, -0.03), (1.55, 3.4, 1.05), "curtain", DULL),
+        "curtain": ((1.45, -3.4, -0.03), (1.55, 3.4, 1.25), "curtain", DULL),
     }
     for name, (low, high, material, solref) in walls.items():
         draw_box(world, name, low, high, material)

@@ -24,6 +24,7 @@ from sims.bodies import (
     rounded_box,
     spinning_top,
     star,
+    teapot_handle_path,
     teapot_like,
     torus,
     vase,
@@ -72,18 +73,18 @@ BODIES = (
 # The bodies start on a helix, metres: its radius, the height of the first, and the rise from each to the next.
 HELIX_RADIUS, HELIX_START, HELIX_RISE = 0.36, 0.3, 0.11
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-SEED = 12
+SEED = 18
 # Enough for a hull to follow its body within a millimetre, few enough to collide fast.
 HULL_VERTICES = 250
 
 
 def build() -> mujoco.MjModel:
     """Floor and bodies, each body turned at random before it falls."""
-    spec = new_stage(position=(0.25, -2.1, 1.6), target=(0.0, 0.02, 0.16), fovy=36)
+    spec = new_stage(position=(0.22, -2.0, 1.45), target=(0.0, -0.05, 0.12), fovy=36)
     add_material(spec, "floor", (0.74, 0.72, 0.69))
     for name, (rgb, gloss) in PALETTE.items():
         add_material(spec, name, rgb, gloss)
-    draw_box(spec.worldbody, "floor", (-3.6, -3.6, -0.1), (3.6, 3.6, 0.0), "floor")
+    draw_box(spec.worldbody, "floor", (-4.2, -3.4, -0.1), (4.2, 5.0, 0.0), "floor")
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], group=HIDDEN_GROUP, friction=FRICTION)
     hulls = _shapes(spec)
     random = np.random.default_rng(SEED)
@@ -143,7 +144,7 @@ def _shapes(spec: mujoco.MjSpec) -> dict[str, list[dict]]:
         "gear": [_solid(CYLINDER, 0.1595, 0.035)],
         "die": [_solid(BOX, 0.11, 0.11, 0.11)],
         "torus": _chain(_circle(16, 0.12), 0.04),
-        "knot": _chain(knot_path(48), 0.036),
+        "knot": _chain(knot_path(56), 0.036),
         "vase": [*sliced("vase", 0.34, (0.003, 0.63), (0.6, 0.88), (0.84, 1)), _foot(0.17 * 0.34)],
         "star": _star_arms(),
         "ball": [_solid(SPHERE, 0.12)],
@@ -203,20 +204,21 @@ def _circle(count: int, radius: float) -> np.ndarray:
 def _teapot_parts(radius: float) -> list[dict]:
     spout = radius * np.array([[0.8, 0, 0.41], [1.05, 0, 0.5], [1.28, 0, 0.75], [1.42, 0, 1.02], [1.55, 0, 1.13]])
     bars = [_bars(spout[k : k + 2], share * radius)[0] for k, share in enumerate((0.25, 0.21, 0.16, 0.125))]
-    handle = [[-0.85, 0, 1.0], [-1.2, 0, 1.08], [-1.5, 0, 0.95], [-1.5, 0, 0.68], [-1.2, 0, 0.4], [-0.85, 0, 0.3]]
     return [
         *bars,
-        *_bars(radius * np.array(handle), 0.085 * radius),
+        *_bars(teapot_handle_path(18, radius), 0.085 * radius),
         _foot(0.52 * radius),
     ]
 
 
 def _star_arms() -> list[dict]:
-    middle = [_solid(CYLINDER, 0.042, 0.0392), _solid(CYLINDER, 0.066, 0.035), _solid(ELLIPSOID, 0.093, 0.093, 0.036)]
+    # Discs follow the dome between the arms: radius and half thickness, metres.
+    dome = ((0.042, 0.0392), (0.06, 0.037), (0.073, 0.0335), (0.085, 0.0275), (0.093, 0.018))
+    middle = [_solid(CYLINDER, *size) for size in dome]
     turns = np.arange(5) * 2 * np.pi / 5
     places = 0.085 * np.stack([np.cos(turns), np.sin(turns), np.zeros(5)], axis=1)
     arms = [
-        _solid(ELLIPSOID, 0.085, 0.05, 0.037, at=tuple(place), turn=turn)
+        _solid(ELLIPSOID, 0.086, 0.055, 0.0405, at=tuple(place), turn=turn)
         for place, turn in zip(places, turns, strict=True)
     ]
     return middle + arms
@@ -231,7 +233,7 @@ def _mug_staves(radius: float, height: float) -> list[dict]:
             BOX,
             wall / 2,
             half_width,
-            height / 2 - 0.002,
+            height / 2,
             at=(middle * math.cos(turn), middle * math.sin(turn), height / 2),
             turn=turn,
         )
@@ -240,7 +242,7 @@ def _mug_staves(radius: float, height: float) -> list[dict]:
     return [
         *staves,
         _solid(CYLINDER, radius * 0.93, wall / 2, at=(0.0, 0.0, wall / 2)),
-        *_bars(mug_handle_path(10, radius, height), 0.12 * radius),
+        *_bars(mug_handle_path(18, radius, height), 0.12 * radius),
     ]
 
 

@@ -40,7 +40,8 @@ class Renderer:
             renderer.update_scene(data, camera="front")
             rgb = renderer.render()
 
-    model: the compiled model. height, width: of the picture, pixels.
+    model: the compiled model; edges are antialiased unless its `visual/quality` says offsamples = 0. height, width: of
+        the picture, pixels.
     environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
         HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
     lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
@@ -253,7 +254,8 @@ class Renderer:
         reach = DIRECTIONAL_REACH * float(self._model.stat.extent)
         self._delta_lights = make_delta_lights(deltas, 1, reach, device)
 
-        self._surfaces = make_surfaces(1, self._width, self._height, device)
+        antialias = self._model.vis.quality.offsamples > 1
+        self._surfaces = make_surfaces(1, self._width, self._height, antialias, device)
         self._film = make_film(1, self._width, self._height, background, device)
         self._received = self._make_received(self._surfaces.slots)
         self._vertices = None

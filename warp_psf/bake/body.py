@@ -11,10 +11,13 @@ import warp as wp
 
 from warp_psf.bake import visibility
 from warp_psf.bake.adapt import ERROR_THRESHOLD, reduce_shell
+from warp_psf.bake.kept import BakedBody, load_body, save_body
 from warp_psf.bake.transfer import bake_transfer
+from warp_psf.basis import sh
 from warp_psf.device import find_device
 from warp_psf.field.shells import (
     FINEST_RESOLUTION,
+    FIRST_OUTER_SHELL,
     SHELL_COUNT,
     SHELL_SPACING,
     ShadowField,
@@ -22,27 +25,15 @@ from warp_psf.field.shells import (
     sample_directions,
     shell_radii,
 )
-from warp_psf.field.store import load_arrays, save_arrays, store_key
+from warp_psf.field.store import store_key
 from warp_psf.scene.mesh import Mesh
 
 # Raised whenever the same settings would give other numbers, so that older files on disk are not used.
-BAKE_VERSION = 1
+BAKE_VERSION = 2
+ORDERS = range(2, 7)
+# Samples that left the solid at points this close, in bounding radii, left it at the same point.
+SAME_POINT = 1.0e-5
 Progress = Callable[[float], None]
-
-
-@dataclass(frozen=True)
-class BakedBody:
-    """What is precomputed of a mesh.
-
-    field: its object occlusion field, or None where visibility has a closed form (boxes, rectangles, spheres).
-    transfer: self-visibility times cosine per vertex, on SH, float32 [vertices, coefficients], in the body's frame;
-        None for convex bodies, which do not shadow themselves.
-    visibility: self-visibility alone (zero below the horizon), likewise.
-    """
-
-    field: ShadowField | None
-    transfer: np.ndarray | None
-    visibility: np.ndarray | None
 
 
 def bake_mesh(
@@ -58,30 +49,32 @@ def bake_mesh(
 
     order: SH bands, 2 to 6. threshold: of Tamura 2006, Equation 1; None keeps every sample. progress: called with the
     finished share, 0 to 1. use_cache: False neither reads nor writes the cache.
+
+    Raises:
+        ValueError: the order or the threshold is out of range.
     """
-    needs_field = mesh.slab is None and mesh.sphere is None
-    if not needs_field and mesh.convex:
+    _check_settings(mesh, order, threshold)
+    report = progress or (lambda share: None)
+    if mesh.slab is not None or mesh.sphere is not None:
+        report(1.0)
         return BakedBody(None, None, None)
     settings = {"bake": BAKE_VERSION, "kind": "body", "order": order, "threshold": threshold}
+    settings |= {"convex": mesh.convex, "closed": mesh.closed}
     key = store_key(settings, mesh.vertices, mesh.faces, mesh.normals)
-    stored = load_arrays(key) if use_cache else None
-    body = None if stored is None else _unpack(stored)
+    body = load_body(key, mesh, order, has_transfer=not mesh.convex) if use_cache else None
     if body is None:
-        report = progress or (lambda share: None)
         on_device = find_device(device)
         warp_mesh = upload_mesh(mesh, on_device)
         transfer, self_visibility = None, None
         if not mesh.convex:
             transfer, self_visibility = bake_transfer(mesh, warp_mesh, order, on_device)
         report(0.1)
-        field = None
-        if needs_field:
-            field = bake_field(mesh, warp_mesh, order, threshold, on_device, lambda share: report(0.1 + 0.9 * share))
+        # The last step is reported once the result is kept.
+        field = bake_field(mesh, warp_mesh, order, threshold, on_device, lambda share: report(0.1 + 0.89 * share))
         body = BakedBody(field, transfer, self_visibility)
         if use_cache:
-            save_arrays(key, _pack(body))
-    if progress is not None:
-        progress(1.0)
+            save_body(key, body)
+    report(1.0)
     return body
 
 
@@ -91,19 +84,28 @@ def bake_radiance_field(
     """Bakes the source radiance field of a luminous mesh, or reads it from the cache.
 
     face_radiance: radiance that leaves the front of each face, relative to the light's own, float [faces].
+
+    Raises:
+        ValueError: the order is out of range, or the radiance is not one finite number, at least 0, per face.
     """
+    _check_settings(mesh, order, ERROR_THRESHOLD)
     settings = {"bake": BAKE_VERSION, "kind": "radiance", "order": order, "threshold": ERROR_THRESHOLD}
+    settings["closed"] = mesh.closed
     radiance = np.ascontiguousarray(face_radiance, np.float32)
+    if radiance.shape != (len(mesh.faces),) or not (np.isfinite(radiance) & (radiance >= 0)).all():
+        raise ValueError(
+            f"mesh {mesh.name!r}: its radiance has the shape {list(radiance.shape)}; "
+            f"give {len(mesh.faces)} finite numbers of at least 0, one per face"
+        )
     key = store_key(settings, mesh.vertices, mesh.faces, radiance)
-    stored = load_arrays(key) if use_cache else None
-    body = None if stored is None else _unpack(stored)
+    body = load_body(key, mesh, order, has_transfer=False) if use_cache else None
     if body is not None and body.field is not None:
         return body.field
     on_device = find_device(device)
     warp_mesh = upload_mesh(mesh, on_device)
     field = bake_field(mesh, warp_mesh, order, ERROR_THRESHOLD, on_device, lambda share: None, radiance)
     if use_cache:
-        save_arrays(key, _pack(BakedBody(field, None, None)))
+        save_body(key, BakedBody(field, None, None))
     return field
 
 
@@ -116,50 +118,90 @@ def bake_field(
     report: Progress,
     face_radiance: np.ndarray | None = None,
 ) -> ShadowField:
-    """Samples every shell, moves samples out of the solid, reduces each shell and quantises it."""
-    shells, inside = [], []
-    for shell in range(SHELL_COUNT):
-        vectors, within = bake_shell(mesh, warp_mesh, shell, FINEST_RESOLUTION, order, device, face_radiance)
-        shells.append(vectors)
-        inside.append(within)
-        report((shell + 1) / SHELL_COUNT)
+    """Samples every shell, reduces each of them and quantises it."""
+    inner: list[_InnerShell] = []
+    for shell in reversed(range(FIRST_OUTER_SHELL + 1)):
+        inner.insert(0, _bake_inner_shell(mesh, warp_mesh, shell, order, device, face_radiance, inner[:1]))
+        report(len(inner) / SHELL_COUNT)
+    shells, inside = [samples.vectors for samples in inner], [samples.inside for samples in inner]
+    for shell in range(FIRST_OUTER_SHELL + 1, SHELL_COUNT):
+        points, outward = _sample_points(mesh, shell)
+        shells.append(_project(mesh, warp_mesh, shell, points, outward, order, device, face_radiance))
+        inside.append(np.zeros(len(points), bool))
+        report(len(shells) / SHELL_COUNT)
+    grid = (FINEST_RESOLUTION, FINEST_RESOLUTION)
+    shells = [vectors.reshape(*grid, -1) for vectors in shells]
     if threshold is not None:
-        shells = [
-            reduce_shell(vectors, threshold, can_be_read(inside, shell)) for shell, vectors in enumerate(shells)
-        ]
+        inside = [within.reshape(grid) for within in inside]
+        shells = [reduce_shell(vectors, threshold, can_be_read(inside, shell)) for shell, vectors in enumerate(shells)]
     return quantise(mesh.center, mesh.radius, shells)
 
 
-def bake_shell(
+@dataclass(frozen=True)
+class _InnerShell:
+    """A shell no larger than the bounding sphere.
+
+    points: where each sample was taken, float32 [samples, 3]; inside: which ones had to leave the solid for that;
+    vectors: float32 [samples, coefficients].
+    """
+
+    points: np.ndarray
+    inside: np.ndarray
+    vectors: np.ndarray
+
+
+def _bake_inner_shell(
     mesh: Mesh,
     warp_mesh: wp.Mesh,
     shell: int,
-    resolution: int,
     order: int,
     device: wp.Device,
-    face_radiance: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """One shell's vectors, float32 [resolution, resolution, coefficients], and which samples lie inside the solid.
+    face_radiance: np.ndarray | None,
+    next_shell: list[_InnerShell],
+) -> _InnerShell:
+    """Samples a shell whose samples may lie inside the solid; `next_shell` holds the one around it, if it has one.
 
     A sample inside the solid would be covered all around and darken receivers outside. It is moved along its radius
-    to the surface instead, where it tells what the nearest receivers outside see.
+    to the surface instead, where it tells what the nearest receivers outside see. Where the next shell's sample went
+    to the same point, its vector is taken over.
     """
-    outward = sample_directions(resolution).reshape(-1, 3)
-    distance = shell_radii(mesh.radius)[shell]
-    points = (mesh.center + distance * outward).astype(np.float32)
-    inside = np.zeros(len(points), bool)
+    points, outward = _sample_points(mesh, shell)
+    points, inside = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, mesh.closed, points, device)
+    vectors = np.empty((len(points), sh.coefficient_count(order)), np.float32)
+    known = np.zeros(len(points), bool)
+    if next_shell:
+        apart = np.linalg.norm(points - next_shell[0].points, axis=1)
+        known = inside & (apart < SAME_POINT * mesh.radius)
+        vectors[known] = next_shell[0].vectors[known]
+    new = ~known
+    vectors[new] = _project(mesh, warp_mesh, shell, points[new], outward[new], order, device, face_radiance)
+    return _InnerShell(points, inside, vectors)
+
+
+def _sample_points(mesh: Mesh, shell: int) -> tuple[np.ndarray, np.ndarray]:
+    """A shell's samples in the body's frame, float32 [samples, 3], and their directions from the centre, float64."""
+    outward = sample_directions(FINEST_RESOLUTION).reshape(-1, 3)
+    return (mesh.center + shell_radii(mesh.radius)[shell] * outward).astype(np.float32), outward
+
+
+def _project(
+    mesh: Mesh,
+    warp_mesh: wp.Mesh,
+    shell: int,
+    points: np.ndarray,
+    outward: np.ndarray,
+    order: int,
+    device: wp.Device,
+    face_radiance: np.ndarray | None,
+) -> np.ndarray:
+    """The vectors at points of a shell, float32 [N, coefficients], with the rays that its distance asks for."""
     radii = SHELL_SPACING * (1 + shell)
-    if radii <= 1.0 + 1e-6:
-        points, inside = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, points, device)
-        half_angle, rays = math.pi, visibility.RAYS_INSIDE
-    else:
+    half_angle = math.pi
+    if radii >= 1.0:
         # A little wider than the bounding sphere, whose radius is exact to float32 only.
-        half_angle = min(math.asin(1 / radii) * 1.001, math.pi / 2)
-        rays = visibility.RAYS_NEAR if radii < visibility.FAR_RADII else visibility.RAYS_FAR
-    vectors = visibility.project_coverage(
-        warp_mesh, points, (-outward).astype(np.float32), half_angle, rays, order, device, face_radiance
-    )
-    return vectors.reshape(resolution, resolution, -1), inside.reshape(resolution, resolution)
+        half_angle = min(1.001 * math.asin(1 / radii), math.pi / 2)
+    rays, axes = visibility.rays_at(radii), (-outward).astype(np.float32)
+    return visibility.project_coverage(warp_mesh, points, axes, half_angle, rays, order, device, face_radiance)
 
 
 def can_be_read(inside: list[np.ndarray], shell: int) -> np.ndarray:
@@ -186,32 +228,8 @@ def upload_mesh(mesh: Mesh, device: wp.Device) -> wp.Mesh:
     )
 
 
-def _pack(body: BakedBody) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {}
-    if body.field is not None:
-        field = body.field
-        arrays |= {
-            "center": field.center,
-            "radius": np.array(field.radius),
-            "resolutions": field.resolutions,
-            "codes": field.codes,
-            "minimum": field.minimum,
-            "step": field.step,
-        }
-    if body.transfer is not None and body.visibility is not None:
-        arrays |= {"transfer": body.transfer, "visibility": body.visibility}
-    return arrays
-
-
-def _unpack(arrays: dict[str, np.ndarray]) -> BakedBody | None:
-    field = None
-    if "codes" in arrays:
-        field = ShadowField(
-            arrays["center"],
-            float(arrays["radius"]),
-            arrays["resolutions"],
-            arrays["codes"],
-            arrays["minimum"],
-            arrays["step"],
-        )
-    return BakedBody(field, arrays.get("transfer"), arrays.get("visibility"))
+def _check_settings(mesh: Mesh, order: int, threshold: float | None) -> None:
+    if order not in ORDERS:
+        raise ValueError(f"mesh {mesh.name!r}: cannot bake order {order}; choose 2 to 6 spherical-harmonics bands")
+    if threshold is not None and not threshold >= 0:
+        raise ValueError(f"mesh {mesh.name!r}: the threshold is {threshold}; give a number of at least 0, or None")

@@ -15,18 +15,20 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.device import launch
 
-# Rays per sample. Inside the bounding sphere they cover all directions; outside, only the cone of the bounding sphere.
-RAYS_INSIDE = 1536
-RAYS_NEAR = 768
-RAYS_FAR = 384
-# Beyond this many bounding radii the cone is below 8 % of the sphere, and half the rays leave the same error.
-FAR_RADII = 2.0
-# Rays that decide whether a point is inside the solid: by the share of back faces among their first hits.
-RAYS_INSIDE_TEST = 48
+# Rays per sample: (from how many bounding radii on, rays). Within the bounding sphere they cover all directions;
+# beyond, only its cone. The error of a coefficient goes as (solid angle of the cone) / (rays)^(3/4): it falls outwards.
+RAYS = ((0.0, 1536), (1.0, 768), (2.0, 384), (3.0, 192))
+# Rays that decide whether a point is inside the solid, by how many more back than front faces each crosses.
+RAYS_INSIDE_TEST = 24
+# A point is inside when its rays leave more layers than they enter, on the mean: every one of them in a closed mesh,
+# except where a ray grazes an edge. An open mesh has no inside, but who is all but walled in by back faces may count
+# as inside; a receiver under a dome or in a cup must not, so that nearly all directions have to be walled in.
+LEAST_WINDING_CLOSED = 0.5
+LEAST_WINDING_OPEN = 0.9
 # How far a ray's origin leaves the surface, in bounding radii: enough for float32, too little to be seen.
 SURFACE_OFFSET = 1.0e-4
 # Layers of surface that a walk out of the solid crosses before it gives up.
-MOST_LAYERS = 16
+MOST_LAYERS = 32
 # A vector is rotated through its values at a quadrature's directions: exact for twice the highest degree.
 ROTATION_POINTS = {2: 16, 3: 16, 4: 32, 5: 64, 6: 64}
 
@@ -131,6 +133,23 @@ def make_visibility(order: int) -> SimpleNamespace:
     )
 
 
+@wp.func
+def layers_left(mesh: wp.uint64, start: wp.vec3, direction: wp.vec3, reach: float, nudge: float) -> int:
+    """Layers of solid over a point in a direction: back faces crossed on the way out, less front faces."""
+    left = wp.int32(0)
+    crossed = wp.int32(0)
+    walk = start
+    while crossed < MOST_LAYERS:
+        hit = wp.mesh_query_ray(mesh, walk, direction, reach)
+        if hit.result:
+            left += wp.where(hit.sign < 0.0, 1, -1)
+            walk += (hit.t + nudge) * direction
+            crossed += 1
+        else:
+            crossed = MOST_LAYERS
+    return left
+
+
 @wp.kernel(module="unique")
 def _leave_solid(
     first: int,
@@ -138,6 +157,7 @@ def _leave_solid(
     center: wp.vec3,
     reach: float,
     nudge: float,
+    least_winding: float,
     rays: wp.array(dtype=wp.vec3),  # (ray)
     points: wp.array(dtype=wp.vec3),  # (sample), moved out of the solid in place
     inside_out: wp.array(dtype=wp.int32),  # (sample)
@@ -145,53 +165,46 @@ def _leave_solid(
     world, sample = wp.tid()
     sample += first
     point = points[sample]
-    hits = int(0)
-    back_faces = int(0)
+    winding = wp.float32(0.0)
     for ray in range(rays.shape[0]):
-        hit = wp.mesh_query_ray(mesh, point, rays[ray], reach)
-        if hit.result:
-            hits += 1
-            if hit.sign < 0.0:
-                back_faces += 1
-    inside = 2 * back_faces > hits
+        winding += float(layers_left(mesh, point, rays[ray], reach, nudge))
+    inside = winding > least_winding * float(rays.shape[0])
     inside_out[sample] = wp.where(inside, 1, 0)
     if inside:
-        # Walk out along the radius until as many layers were left as entered: parts of a body may overlap.
+        # Along the radius, cross layers until as many were left as lie over the point: parts of a body may overlap.
         outward = wp.normalize(point - center)
-        depth = int(0)
-        walk = point
-        for _layer in range(MOST_LAYERS):
-            hit = wp.mesh_query_ray(mesh, walk, outward, reach)
+        depth = layers_left(mesh, point, outward, reach, nudge)
+        while depth > 0:
+            hit = wp.mesh_query_ray(mesh, point, outward, reach)
             if hit.result:
-                depth += wp.where(hit.sign < 0.0, 1, -1)
-                walk += (hit.t + nudge) * outward
-        # `depth` is how many layers lie over the point; cross that many and stop in the open.
-        for _layer in range(MOST_LAYERS):
-            if depth > 0:
-                hit = wp.mesh_query_ray(mesh, point, outward, reach)
-                if hit.result:
-                    depth -= wp.where(hit.sign < 0.0, 1, -1)
-                    point += (hit.t + nudge) * outward
-                else:
-                    depth = 0
+                depth -= wp.where(hit.sign < 0.0, 1, -1)
+                point += (hit.t + nudge) * outward
+            else:
+                depth = 0
         points[sample] = point
 
 
 def leave_solid(
-    mesh: wp.Mesh, center: np.ndarray, radius: float, points: np.ndarray, device: wp.Device
+    mesh: wp.Mesh, center: np.ndarray, radius: float, closed: bool, points: np.ndarray, device: wp.Device
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moves the points that lie inside the solid along their radius to its surface.
+    """Moves the points that lie inside the solid along their radius to just outside its surface.
 
-    Returns the moved points, float32 [N, 3], and which ones were inside, bool [N]. A point counts as inside when most
-    rays from it meet a back face first, which also serves open meshes.
+    center, radius: the bounding sphere; closed: whether the mesh has an inside (see `LEAST_WINDING_OPEN`).
+    Returns the moved points, float32 [N, 3], and which ones were inside, bool [N].
     """
     rays = wp.array(sphere.fibonacci_cap(RAYS_INSIDE_TEST, math.pi), dtype=wp.vec3, device=device)
     moved = wp.array(points, dtype=wp.vec3, device=device)
     inside = wp.zeros(len(points), dtype=wp.int32, device=device)
     nudge = SURFACE_OFFSET * radius
-    inputs = [mesh.id, wp.vec3(*map(float, center)), 4.0 * radius, nudge, rays, moved]
+    least_winding = LEAST_WINDING_CLOSED if closed else LEAST_WINDING_OPEN
+    inputs = [mesh.id, wp.vec3(*map(float, center)), 4.0 * radius, nudge, least_winding, rays, moved]
     launch(_leave_solid, (1, len(points)), inputs, [inside], device)
     return moved.numpy(), inside.numpy().astype(bool)
+
+
+def rays_at(radii: float) -> int:
+    """Rays per sample at a distance of `radii` bounding radii from the centre."""
+    return [rays for start, rays in RAYS if radii >= start][-1]
 
 
 def project_coverage(

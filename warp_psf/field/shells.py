@@ -144,8 +144,9 @@ def make_fields(order: int) -> SimpleNamespace:
     def lookup_coverage(table: FieldTable, field: int, p_body: wp.vec3) -> vec:
         """The vector at a point of the body's frame: bilinear on the two nearest shells, then between them."""
         offset = p_body - table.center[field]
-        distance = wp.max(wp.length(offset), 1.0e-9)  # metres; the centre itself has no direction
-        theta = wp.acos(wp.clamp(offset[2] / distance, -1.0, 1.0)) * wp.static(1.0 / math.pi)
+        distance = wp.length(offset)
+        # atan2, because acos has no digits left near the poles; the centre itself has no direction, and any will do.
+        theta = wp.atan2(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]), offset[2]) * wp.static(1.0 / math.pi)
         phi = wp.atan2(offset[1], offset[0]) * wp.static(0.5 / math.pi)
 
         # In units of the spacing, shell c has radius c + 1.
@@ -194,8 +195,8 @@ def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):
 def lookup(field: ShadowField, points_body: np.ndarray) -> np.ndarray:
     """The vectors at points of the body's frame [N, 3], float64 [N, coefficients]: the twin of `lookup_coverage`."""
     offset = np.asarray(points_body, np.float64) - field.center
-    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
-    theta = np.arccos(np.clip(offset[:, 2] / distance, -1, 1)) / math.pi
+    distance = np.linalg.norm(offset, axis=-1)
+    theta = np.arctan2(np.hypot(offset[:, 0], offset[:, 1]), offset[:, 2]) / math.pi
     phi = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * math.pi)
     radius = distance / (SHELL_SPACING * field.radius)
     clamped = np.clip(radius, 1, SHELL_COUNT)

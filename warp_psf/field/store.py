@@ -79,13 +79,29 @@ def load_arrays(key: str) -> dict[str, np.ndarray] | None:
             raise ValueError("it does not begin as a field does")
         if hashlib.sha256(content[head:]).digest() != content[len(_MAGIC) : head]:
             raise ValueError("its check sum does not match")
-        with np.load(io.BytesIO(content[head:]), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
+        return _read_archive(content[head:])
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         warnings.warn(f"the cached field {path} is damaged ({error}); it is baked again", stacklevel=2)
         return None
+
+
+def _read_archive(content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an archive; a ValueError when it is not one that `save_arrays` writes."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            arrays = {}
+            for entry in archive.infolist():
+                # Stored as it is, an array is never larger than the file, whatever its header says.
+                if entry.compress_type != zipfile.ZIP_STORED:
+                    raise ValueError(f"{entry.filename} is compressed")
+                # Reading from memory checks the promised size against what is there, and unpickles nothing.
+                array = np.lib.format.read_array(io.BytesIO(archive.read(entry)), allow_pickle=False)
+                arrays[entry.filename.removesuffix(".npy")] = array
+            return arrays
+    except Exception as error:  # zipfile and NumPy meet a broken archive with many types of error
+        raise ValueError(str(error) or type(error).__name__) from error
 
 
 def _path(key: str) -> Path:

@@ -57,7 +57,7 @@ class Surfaces:
     extra: wp.array  # (world, pixel) int32
     edge: wp.array  # (world, pixel) int32, 1 on edge pixels
     edge_rank: wp.array  # (world, pixel) int32, running count of edge pixels
-    edge_capacity: int
+    edge_capacity: int  # 0: no antialiasing
     camera: CameraTable
 
     @property
@@ -248,10 +248,10 @@ def _trace_edges(
             receivers.entity[world, slot + group - 1] = -1
 
 
-def make_surfaces(worlds: int, width: int, height: int, device: wp.Device) -> Surfaces:
-    """Room for the surfaces of a film of width x height pixels."""
+def make_surfaces(worlds: int, width: int, height: int, antialias: bool, device: wp.Device) -> Surfaces:
+    """Room for the surfaces of a film of width x height pixels; without `antialias` a pixel is its centre."""
     pixels = width * height
-    capacity = math.ceil(EDGE_SHARE * pixels)
+    capacity = math.ceil(EDGE_SHARE * pixels) if antialias else 0
     shape = (worlds, pixels + EXTRA_GROUPS * capacity)
     receivers = make_receivers(shape, device)
     receivers.entity.fill_(-1)
@@ -277,6 +277,9 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     camera, receivers = surfaces.camera, surfaces.receivers
     dim = surfaces.edge.shape
     launch(_trace_centers, dim, [scene.geometry, scene.poses, camera, receivers], [], device)
+    if surfaces.edge_capacity == 0:
+        surfaces.extra.fill_(-1)
+        return
     launch(_find_edges, dim, [camera, receivers], [surfaces.edge], device)
     wp.utils.array_scan(surfaces.edge.flatten(), surfaces.edge_rank.flatten(), inclusive=False)
     # What an earlier frame left in slots that this frame's edges do not reach.

@@ -178,7 +178,10 @@ def make_direct(order: int) -> SimpleNamespace:
 def lobe_polynomial(profile: np.ndarray) -> np.ndarray:
     """Ascending coefficients, in the cosine to the axis, of a zonal function with the profile f_l, float64 [order]."""
     bands = np.arange(len(profile))
-    return np.polynomial.legendre.leg2poly(profile * np.sqrt((2 * bands + 1) / (4 * np.pi)))
+    polynomial = np.zeros(len(profile))
+    trimmed = np.polynomial.legendre.leg2poly(profile * np.sqrt((2 * bands + 1) / (4 * np.pi)))
+    polynomial[: len(trimmed)] = trimmed
+    return polynomial
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,93 @@
+"""Baked bodies and the arrays that stand for them in the cache."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_psf.basis import sh
+from warp_psf.field.shells import COARSEST_RESOLUTION, FINEST_RESOLUTION, SHELL_COUNT, ShadowField
+from warp_psf.field.store import load_arrays, save_arrays
+from warp_psf.scene.mesh import Mesh
+
+RESOLUTIONS = [2**k for k in range(FINEST_RESOLUTION.bit_length()) if 2**k >= COARSEST_RESOLUTION]
+
+
+@dataclass(frozen=True)
+class BakedBody:
+    """What is precomputed of a mesh.
+
+    field: its object occlusion field, or None where visibility has a closed form (boxes, rectangles, spheres).
+    transfer: self-visibility times cosine per vertex, on SH, float32 [vertices, coefficients], in the body's frame;
+        None for convex bodies, which do not shadow themselves.
+    visibility: self-visibility alone (zero below the horizon), likewise.
+    """
+
+    field: ShadowField | None
+    transfer: np.ndarray | None
+    visibility: np.ndarray | None
+
+
+def save_body(key: str, body: BakedBody) -> None:
+    """Keeps a body with a field under a key."""
+    field = body.field
+    arrays: dict[str, np.ndarray] = {}
+    if field is not None:
+        arrays |= {
+            "center": field.center,
+            "radius": np.array(field.radius),
+            "resolutions": field.resolutions,
+            "codes": field.codes,
+            "minimum": field.minimum,
+            "step": field.step,
+        }
+    if body.transfer is not None and body.visibility is not None:
+        arrays |= {"transfer": body.transfer, "visibility": body.visibility}
+    save_arrays(key, arrays)
+
+
+def load_body(key: str, mesh: Mesh, order: int, has_transfer: bool) -> BakedBody | None:
+    """The body kept under a key, or None when there is none, or (which is said) none that can be used."""
+    arrays = load_arrays(key)
+    if arrays is None:
+        return None
+    if wrong := _find_wrong(arrays, sh.coefficient_count(order), len(mesh.vertices) if has_transfer else None):
+        warnings.warn(f"the cached field of mesh {mesh.name!r} has a wrong {wrong!r}; it is baked again", stacklevel=3)
+        return None
+    field = ShadowField(
+        center=arrays["center"],
+        radius=float(arrays["radius"]),
+        resolutions=arrays["resolutions"],
+        codes=arrays["codes"],
+        minimum=arrays["minimum"],
+        step=arrays["step"],
+    )
+    return BakedBody(field, arrays.get("transfer"), arrays.get("visibility"))
+
+
+def _find_wrong(arrays: dict[str, np.ndarray], coefficients: int, vertices: int | None) -> str | None:
+    """The name of an array that is not as `save_body` writes it, or None; `vertices` is None without a transfer."""
+    layout: dict[str, tuple[type, tuple[int, ...]]] = {
+        "resolutions": (np.int32, (SHELL_COUNT,)),
+        "center": (np.float32, (3,)),
+        "radius": (np.float64, ()),
+        "minimum": (np.float32, (SHELL_COUNT, coefficients)),
+        "step": (np.float32, (SHELL_COUNT, coefficients)),
+    }
+    if vertices is not None:
+        layout |= dict.fromkeys(("transfer", "visibility"), (np.float32, (vertices, coefficients)))
+    for name, (dtype, shape) in layout.items():
+        array = arrays.get(name)
+        if array is None or array.dtype != dtype or array.shape != shape or not np.isfinite(array).all():
+            return name
+    if not np.isin(arrays["resolutions"], RESOLUTIONS).all():
+        return "resolutions"
+    if not arrays["radius"] > 0:
+        return "radius"
+    codes, samples = arrays.get("codes"), int((arrays["resolutions"].astype(np.int64) ** 2).sum())
+    if codes is None or codes.dtype != np.uint8 or codes.shape != (samples, coefficients):
+        return "codes"
+    unexpected = arrays.keys() - layout.keys() - {"codes"}
+    return min(unexpected) if unexpected else None
