@@ -175,16 +175,30 @@ def test_within_the_first_shell_a_field_is_that_of_the_first(fields, look_up):
 
 
 def test_outside_the_bounding_sphere_solid_angle_is_interpolated_exactly():
-    """A constant over r^2 on every shell comes back at every radius between the outer shells and beyond."""
+    """A constant over r^2 on every shell comes back at every radius between the outer shells and beyond.
+
+    It covers too little of the sphere to be the surface of a body that touches the bounding sphere.
+    """
     radii = shell_radii(1.0)
-    shells = [np.full((8, 8, COEFFICIENTS), 1 / r**2) for r in radii]
+    shells = [np.full((8, 8, COEFFICIENTS), 1e-6 / r**2) for r in radii]
     field = quantise(np.zeros(3), 1.0, shells)
     between = np.random.default_rng(8).uniform(radii[FIRST_OUTER_SHELL], 30.0, 300)
     found = lookup(field, points_at(field, between, directions(300)))
-    np.testing.assert_allclose(found, np.broadcast_to(1 / between[:, None] ** 2, found.shape), rtol=1e-5)
+    np.testing.assert_allclose(found, np.broadcast_to(1e-6 / between[:, None] ** 2, found.shape), rtol=1e-5)
 
 
 def test_an_empty_table_can_be_uploaded():
     table = upload_fields([], ORDER, find_device("cpu"))
     assert table.samples.shape == (0,)
     assert table.shell_first.shape == (0, SHELL_COUNT)
+
+
+def test_right_above_a_surface_coverage_falls_as_the_root_of_the_height():
+    """Between the first outer shells, the solid angle of a sphere's cap: fully covered hemispheres at its surface."""
+    radii = shell_radii(1.0)
+    covered = 1 - np.sqrt(np.clip(1 - 1 / np.maximum(radii, 1) ** 2, 0, None))
+    shells = [np.full((8, 8, COEFFICIENTS), share * np.sqrt(np.pi)) for share in covered]
+    field = quantise(np.zeros(3), 1.0, shells)
+    between = np.linspace(1.0, 1.2, 30)
+    found = lookup(field, points_at(field, between, directions(30)))[:, 0] / np.sqrt(np.pi)
+    np.testing.assert_allclose(found, 1 - np.sqrt(1 - 1 / between**2), atol=1e-6)

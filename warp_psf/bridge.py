@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -69,6 +70,22 @@ def load_model(path: str | os.PathLike) -> mujoco.MjModel:
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"model {str(path)!r} cannot be loaded: {reason}") from error
+
+
+def simulate(model: mujoco.MjModel, frames_per_second: float) -> Iterator[mujoco.MjData]:
+    """The states of a passive simulation from the model's start, frame after frame without end.
+
+    Yields the same `MjData` every time, stepped on; frame 0 is the start. Simulated time follows the frames' to the
+    nearest step.
+    """
+    data = mujoco.MjData(model)
+    for frame in itertools.count():
+        target = round(frame / frames_per_second / model.opt.timestep)
+        while round(data.time / model.opt.timestep) < target:
+            mujoco.mj_step(model, data)
+        # A step leaves the poses of bodies and geoms one step behind the joints.
+        mujoco.mj_forward(model, data)
+        yield data
 
 
 def build_scene(

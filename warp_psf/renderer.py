@@ -21,8 +21,9 @@ from warp_psf.scene.geometry import upload_scene, write_poses
 from warp_psf.scene.light import DeltaLight, Light, area_light_entities
 from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
+from warp_psf.shade.lattice import STRIDES, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occlude import turn_occlusion, upload_occlusion
-from warp_psf.shade.receivers import interpolate_vertices, place_vertices, upload_vertices
+from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
@@ -209,7 +210,7 @@ class Renderer:
         if not self._closed:
             self._closed = True
             del self._device_scene, self._surfaces, self._film, self._occlusion, self._lighting
-            del self._delta_lights, self._received, self._vertices
+            del self._delta_lights, self._received, self._lattice, self._vertices
 
     def __enter__(self) -> Renderer:
         return self
@@ -258,10 +259,12 @@ class Renderer:
         self._surfaces = make_surfaces(1, self._width, self._height, antialias, device)
         self._film = make_film(1, self._width, self._height, background, device)
         self._received = self._make_received(self._surfaces.slots)
+        self._lattice = make_lattice(1, self._surfaces.slots, self._width, self._height, device)
         self._vertices = None
         if self._shading == "vertex":
             self._vertices = upload_vertices(scene, 1, device)
             self._vertices_received = self._make_received(self.vertices)
+            self._vertices_turns = wp.full((1, self.vertices), 1, dtype=wp.int32, device=device)
 
     def _make_received(self, count: int) -> tuple[wp.array, wp.array]:
         """Irradiance and Phong radiance of `count` receivers."""
@@ -284,24 +287,35 @@ class Renderer:
         with self._timed("turn fields"):
             turn_occlusion(self._occlusion, scene, device)
         if self._vertices is None:
-            self._shade(pixels, self._received)
+            self._shade_pixels()
         else:
-            with self._timed("place vertices"):
-                place_vertices(self._vertices, pixels, scene, device)
-            self._shade(self._vertices.receivers, self._vertices_received)
-            with self._timed("interpolate vertices"):
-                interpolate_vertices(self._vertices, pixels, scene, self._vertices_received, *self._received, device)
+            self._shade_vertices(self._vertices)
+        with self._timed("shadow rays"):
+            casts, eye = self._occlusion.table.occluders.casts, self._lighting.table.eye
+            add_delta_lights(pixels, scene, casts, eye, self._delta_lights, *self._received, device)
         with self._timed("resolve pixels"):
             resolve_pixels(self._film, self._surfaces, scene, *self._received, device)
         self._drawn = True
 
-    def _shade(self, receivers, received: tuple[wp.array, wp.array]) -> None:
-        scene, device = self._device_scene, self._device
+    def _shade_pixels(self) -> None:
+        scene, device, pixels = self._device_scene, self._device, self._surfaces.receivers
+        lattice, lights = self._lattice, (self._occlusion, self._lighting)
         with self._timed("shadow fields"):
-            shade_direct(receivers, scene, self._occlusion, self._lighting, *received, device)
-        with self._timed("shadow rays"):
-            casts, eye = self._occlusion.table.occluders.casts, self._lighting.table.eye
-            add_delta_lights(receivers, scene, casts, eye, self._delta_lights, *received, device)
+            begin_lattice(lattice, pixels, self._surfaces.extra, device)
+            for turn in range(1, len(STRIDES) + 1):
+                shade_direct(pixels, lattice.turns, turn, scene, *lights, *self._received, device)
+                if turn < len(STRIDES):
+                    refine_lattice(lattice, turn, pixels, *self._received, device)
+
+    def _shade_vertices(self, vertices: VertexReceivers) -> None:
+        scene, device, pixels = self._device_scene, self._device, self._surfaces.receivers
+        received, lights = self._vertices_received, (self._occlusion, self._lighting)
+        with self._timed("place vertices"):
+            place_vertices(vertices, pixels, scene, device)
+        with self._timed("shadow fields"):
+            shade_direct(vertices.receivers, self._vertices_turns, 1, scene, *lights, *received, device)
+        with self._timed("interpolate vertices"):
+            interpolate_vertices(vertices, pixels, scene, received, *self._received, device)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

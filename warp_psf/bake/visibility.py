@@ -18,16 +18,16 @@ from warp_psf.device import launch
 # Rays per sample: (from how many bounding radii on, rays). Within the bounding sphere they cover all directions;
 # beyond, only its cone. The error of a coefficient goes as (solid angle of the cone) / (rays)^(3/4): it falls outwards.
 RAYS = ((0.0, 1536), (1.0, 768), (2.0, 384), (3.0, 192))
-# Rays that decide whether a point is inside the solid, by how many more back than front faces each crosses.
+# Rays that decide whether a point is inside the solid: those that leave more layers than they enter say so.
 RAYS_INSIDE_TEST = 24
-# A point is inside when its rays leave more layers than they enter, on the mean: every one of them in a closed mesh,
-# except where a ray grazes an edge. An open mesh has no inside, but who is all but walled in by back faces may count
-# as inside; a receiver under a dome or in a cup must not, so that nearly all directions have to be walled in.
-LEAST_WINDING_CLOSED = 0.5
-LEAST_WINDING_OPEN = 0.9
+# The share of them that must say so. In a closed mesh all or none do, except that two flush faces count as one: then
+# up to half of the rays say so outside, and fewer than all inside. An open mesh has no inside, yet who is all but walled
+# in by back faces is as good as inside; a receiver under a dome or in a cup must not be.
+LEAST_SHARE_CLOSED = 0.55
+LEAST_SHARE_OPEN = 0.9
 # How far a ray's origin leaves the surface, in bounding radii: enough for float32, too little to be seen.
 SURFACE_OFFSET = 1.0e-4
-# Layers of surface that a walk out of the solid crosses before it gives up.
+# Layers of surface that a ray out of the solid crosses before it gives up.
 MOST_LAYERS = 32
 # A vector is rotated through its values at a quadrature's directions: exact for twice the highest degree.
 ROTATION_POINTS = {2: 16, 3: 16, 4: 32, 5: 64, 6: 64}
@@ -134,20 +134,25 @@ def make_visibility(order: int) -> SimpleNamespace:
 
 
 @wp.func
-def layers_left(mesh: wp.uint64, start: wp.vec3, direction: wp.vec3, reach: float, nudge: float) -> int:
-    """Layers of solid over a point in a direction: back faces crossed on the way out, less front faces."""
-    left = wp.int32(0)
-    crossed = wp.int32(0)
-    walk = start
-    while crossed < MOST_LAYERS:
-        hit = wp.mesh_query_ray(mesh, walk, direction, reach)
-        if hit.result:
-            left += wp.where(hit.sign < 0.0, 1, -1)
-            walk += (hit.t + nudge) * direction
-            crossed += 1
-        else:
-            crossed = MOST_LAYERS
-    return left
+def is_inside(
+    mesh: wp.uint64, point: wp.vec3, rays: wp.array(dtype=wp.vec3), least_share: float, reach: float, nudge: float
+) -> bool:
+    """Whether at least `least_share` of the rays from a point leave more layers of solid than they enter."""
+    leaving = wp.int32(0)
+    for ray in range(rays.shape[0]):
+        walk = point
+        left = wp.int32(0)
+        crossed = wp.int32(0)
+        while crossed < MOST_LAYERS:
+            hit = wp.mesh_query_ray(mesh, walk, rays[ray], reach)
+            if hit.result:
+                left += wp.where(hit.sign < 0.0, 1, -1)
+                walk += (hit.t + nudge) * rays[ray]
+                crossed += 1
+            else:
+                crossed = MOST_LAYERS
+        leaving += wp.where(left > 0, 1, 0)
+    return float(leaving) >= least_share * float(rays.shape[0])
 
 
 @wp.kernel(module="unique")
@@ -157,7 +162,7 @@ def _leave_solid(
     center: wp.vec3,
     reach: float,
     nudge: float,
-    least_winding: float,
+    least_share: float,
     rays: wp.array(dtype=wp.vec3),  # (ray)
     points: wp.array(dtype=wp.vec3),  # (sample), moved out of the solid in place
     inside_out: wp.array(dtype=wp.int32),  # (sample)
@@ -165,23 +170,20 @@ def _leave_solid(
     world, sample = wp.tid()
     sample += first
     point = points[sample]
-    winding = wp.float32(0.0)
-    for ray in range(rays.shape[0]):
-        winding += float(layers_left(mesh, point, rays[ray], reach, nudge))
-    inside = winding > least_winding * float(rays.shape[0])
+    inside = is_inside(mesh, point, rays, least_share, reach, nudge)
     inside_out[sample] = wp.where(inside, 1, 0)
-    if inside:
-        # Along the radius, cross layers until as many were left as lie over the point: parts of a body may overlap.
-        outward = wp.normalize(point - center)
-        depth = layers_left(mesh, point, outward, reach, nudge)
-        while depth > 0:
-            hit = wp.mesh_query_ray(mesh, point, outward, reach)
-            if hit.result:
-                depth -= wp.where(hit.sign < 0.0, 1, -1)
-                point += (hit.t + nudge) * outward
-            else:
-                depth = 0
-        points[sample] = point
+    outward = wp.normalize(point - center)
+    crossed = wp.int32(0)
+    # Behind a face there may be the inside of another part.
+    while inside and crossed < MOST_LAYERS:
+        hit = wp.mesh_query_ray(mesh, point, outward, reach)
+        if hit.result:
+            point += (hit.t + nudge) * outward
+            crossed += 1
+            inside = is_inside(mesh, point, rays, least_share, reach, nudge)
+        else:
+            crossed = MOST_LAYERS
+    points[sample] = point
 
 
 def leave_solid(
@@ -189,15 +191,15 @@ def leave_solid(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moves the points that lie inside the solid along their radius to just outside its surface.
 
-    center, radius: the bounding sphere; closed: whether the mesh has an inside (see `LEAST_WINDING_OPEN`).
+    center, radius: the bounding sphere; closed: whether the mesh has an inside (see `LEAST_SHARE_OPEN`).
     Returns the moved points, float32 [N, 3], and which ones were inside, bool [N].
     """
     rays = wp.array(sphere.fibonacci_cap(RAYS_INSIDE_TEST, math.pi), dtype=wp.vec3, device=device)
     moved = wp.array(points, dtype=wp.vec3, device=device)
     inside = wp.zeros(len(points), dtype=wp.int32, device=device)
     nudge = SURFACE_OFFSET * radius
-    least_winding = LEAST_WINDING_CLOSED if closed else LEAST_WINDING_OPEN
-    inputs = [mesh.id, wp.vec3(*map(float, center)), 4.0 * radius, nudge, least_winding, rays, moved]
+    least_share = LEAST_SHARE_CLOSED if closed else LEAST_SHARE_OPEN
+    inputs = [mesh.id, wp.vec3(*map(float, center)), 4.0 * radius, nudge, least_share, rays, moved]
     launch(_leave_solid, (1, len(points)), inputs, [inside], device)
     return moved.numpy(), inside.numpy().astype(bool)
 
@@ -227,7 +229,7 @@ def project_coverage(
     local = sphere.fibonacci_cap(ray_count, half_angle)
     ray_solid_angle = 2 * math.pi * (1 - math.cos(half_angle)) / ray_count
     out = wp.zeros(len(points), dtype=kit.vec, device=device)
-    reach = 4.0 * float(np.abs(points).max() + np.abs(mesh.points.numpy()).max())
+    reach = 4.0 * float(np.abs(points).max(initial=0.0) + np.abs(mesh.points.numpy()).max())
     inputs = [
         wp.array(points, dtype=wp.vec3, device=device),
         wp.array(axes, dtype=wp.vec3, device=device),

@@ -85,6 +85,8 @@ def make_direct(order: int) -> SimpleNamespace:
     def shade_receivers(
         first: int,
         receivers: ReceiverTable,
+        turns: wp.array2d(dtype=wp.int32),  # (world, receiver)
+        turn: int,
         geometry: GeometryTable,
         poses: PoseTable,
         o: Occlusion,
@@ -95,7 +97,7 @@ def make_direct(order: int) -> SimpleNamespace:
         world, receiver = wp.tid()
         receiver += first
         entity = receivers.entity[world, receiver]
-        if entity < 0:
+        if entity < 0 or turns[world, receiver] != turn:
             return
         p = receivers.position[world, receiver]
         n = receivers.normal[world, receiver]
@@ -241,6 +243,8 @@ def write_environment(state: DirectState, coefficients: np.ndarray) -> None:
 
 def shade_direct(
     receivers: ReceiverTable,
+    turns: wp.array,
+    turn: int,
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
@@ -248,12 +252,12 @@ def shade_direct(
     glossy: wp.array,
     device: wp.Device,
 ) -> None:
-    """Writes every receiver's irradiance (W/m^2 in the light's units) and its radiance through the Phong lobe.
+    """Writes the irradiance of the receivers whose turn it is, and their radiance through the Phong lobe.
 
-    diffuse, glossy: vec3 (worlds, receivers). Empty slots keep what they held.
+    turns: int32 (worlds, receivers). diffuse, glossy: vec3 (worlds, receivers); the others' values stay.
     """
     kit = make_direct(lighting.order)
-    inputs = [receivers, scene.geometry, scene.poses, occlusion.table, lighting.table]
+    inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.table, lighting.table]
     launch(kit.shade_receivers, diffuse.shape, inputs, [diffuse, glossy], device)
 
 

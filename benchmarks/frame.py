@@ -1,0 +1,115 @@
+"""What a frame costs: `python -m benchmarks.frame`.
+
+Milliseconds per stage and per frame, nanoseconds per receiver and occluder, for bowling, falling and statues at 640x360
+and 1280x720, shaded at pixels and at vertices, in the light of the studio environment (`--lights` adds each scene's own
+area lights). Every configuration runs in a process of its own, so that its peak memory is its own.
+"""
+
+import argparse
+import importlib
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import warp_psf as psf
+
+SCENES = ("bowling", "falling", "statues")
+SIZES = ("640x360", "1280x720")
+SHADINGS = ("pixel", "vertex")
+# The frame whose cost is printed, in simulated seconds: the bodies are in motion and close to one another.
+MOMENTS = {"bowling": 1.2, "falling": 1.5, "statues": 1.0}
+
+
+def measure(scene_name: str, size: str, shading: str, options: argparse.Namespace) -> dict:
+    """Renders one configuration several times and returns the medians, seconds."""
+    scene = importlib.import_module(f"sims.{scene_name}")
+    width, height = map(int, size.split("x"))
+    model = scene.build()
+    data = None
+    for data in scene.states(model, 30, MOMENTS[scene_name]):
+        pass
+    lights = scene.lights() if options.lights else ()
+    with psf.Renderer(
+        model,
+        height,
+        width,
+        lights=lights,
+        order=options.order,
+        shading=shading,
+        model_lights=False,
+        device=options.device,
+    ) as renderer:
+        frames, stages = [], []
+        for _ in range(options.warmup + options.frames):
+            start = time.perf_counter()
+            renderer.update_scene(data, camera="front")
+            renderer.render()
+            frames.append(time.perf_counter() - start)
+            stages.append(renderer.stage_seconds)
+        frames, stages = frames[options.warmup :], stages[options.warmup :]
+        layers = renderer.layers()
+        seen = int((layers["segmentation"][..., 0] >= 0).sum())
+        receivers = seen if shading == "pixel" else renderer.vertices
+        occluders = renderer.occluders
+    per_stage = {stage: statistics.median(found[stage] for found in stages) for stage in stages[0]}
+    return {
+        "scene": scene_name,
+        "size": size,
+        "shading": shading,
+        "order": options.order,
+        "frame": statistics.median(frames),
+        "stages": per_stage,
+        "receivers": receivers,
+        "occluders": occluders,
+        "ns_per_receiver_and_occluder": 1e9 * per_stage["shadow fields"] / max(receivers * occluders, 1),
+        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def print_row(found: dict) -> None:
+    """One line of the table."""
+    stages = "  ".join(f"{name} {1e3 * seconds:.1f}" for name, seconds in found["stages"].items())
+    print(
+        f"{found['scene']:9} {found['size']:>8} {found['shading']:6} {1e3 * found['frame']:8.1f} ms/frame "
+        f"{found['ns_per_receiver_and_occluder']:7.1f} ns {found['receivers']:8} x {found['occluders']:2} "
+        f"{found['peak_memory_bytes'] / 2**20:6.0f} MiB   {stages}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--sizes", nargs="+", default=list(SIZES))
+    parser.add_argument("--shadings", nargs="+", default=list(SHADINGS))
+    parser.add_argument("--order", type=int, default=4)
+    parser.add_argument("--lights", action="store_true", help="with the scene's area lights")
+    parser.add_argument("--frames", type=int, default=7)
+    parser.add_argument("--warmup", type=int, default=2)
+    parser.add_argument("--device")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--only", nargs=3, metavar=("SCENE", "SIZE", "SHADING"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.only:
+        print(json.dumps(measure(*options.only, options)))
+        return
+    rows = []
+    print("ns: of the stage `shadow fields`, on all cores together, per receiver and occluder; stages in ms")
+    for scene in options.scenes:
+        for size in options.sizes:
+            for shading in options.shadings:
+                command = [sys.executable, "-m", "benchmarks.frame", *sys.argv[1:], "--only", scene, size, shading]
+                output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+                rows.append(json.loads(output.splitlines()[-1]))
+                print_row(rows[-1])
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

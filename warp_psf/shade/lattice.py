@@ -1,0 +1,153 @@
+"""Which pixels are shaded, and which lie smoothly between shaded ones.
+
+The light that shadow fields give is smooth. Pixels are shaded on a lattice of every fourth pixel first. A cell of the
+lattice that shows one smooth surface, with nearly the same light at its corners, is interpolated; any other is
+shaded at every second pixel, and where that is still not smooth, at every pixel. Pixels on edges are always shaded.
+"""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from warp_psf.device import launch
+from warp_psf.scene.receiver import ReceiverTable
+
+# Spacings of the lattice, pixels, coarse to fine; a receiver is shaded in the turn of its spacing.
+STRIDES = (4, 2, 1)
+# A cell is interpolated when no channel differs between its corners by more than this share of the brightest corner.
+# The error of a bilinear patch is about an eighth of the differences' change from cell to cell: well below 0.5 %.
+SMOOTH_LIGHT = wp.constant(0.04)
+# ... and when the normals in it lie within acos(0.97), 14 degrees.
+SMOOTH_NORMAL = wp.constant(0.97)
+# A receiver's turn: 0 waits, 1, 2, 3 are the strides' turns, and INTERPOLATED needs none.
+INTERPOLATED = 4
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The turns of the receivers, int32 (world, slot), and the picture they belong to."""
+
+    turns: wp.array
+    width: int
+    height: int
+
+
+@wp.kernel(module="unique")
+def _begin(
+    first: int,
+    receivers: ReceiverTable,
+    extra: wp.array2d(dtype=wp.int32),  # (world, pixel): -1 off edges
+    width: int,
+    turns_out: wp.array2d(dtype=wp.int32),  # (world, slot)
+):
+    world, slot = wp.tid()
+    slot += first
+    turn = int(0)
+    if receivers.entity[world, slot] < 0:
+        turn = wp.static(INTERPOLATED)
+    elif slot >= extra.shape[1] or extra[world, slot] >= 0:
+        turn = 1
+    elif (slot % width) % wp.static(STRIDES[0]) == 0 and (slot / width) % wp.static(STRIDES[0]) == 0:
+        turn = 1
+    turns_out[world, slot] = turn
+
+
+@wp.func
+def nearly_equal(a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
+    highest = wp.max(wp.max(a, b), wp.max(c, d))
+    lowest = wp.min(wp.min(a, b), wp.min(c, d))
+    return wp.max(highest - lowest) <= SMOOTH_LIGHT * wp.max(highest)
+
+
+@wp.func
+def is_smooth(
+    receivers: ReceiverTable,
+    diffuse: wp.array2d(dtype=wp.vec3),
+    glossy: wp.array2d(dtype=wp.vec3),
+    turns: wp.array2d(dtype=wp.int32),
+    world: int,
+    corner: int,
+    width: int,
+    stride: int,
+) -> bool:
+    """Whether the cell whose first corner is the pixel `corner` can be interpolated."""
+    right = corner + stride
+    below = corner + stride * width
+    across = below + stride
+    entity = receivers.entity[world, corner]
+    if entity < 0 or turns[world, right] == 0 or turns[world, below] == 0 or turns[world, across] == 0:
+        return False
+    normal = receivers.normal[world, corner]
+    for y in range(stride + 1):
+        for x in range(stride + 1):
+            pixel = corner + y * width + x
+            if receivers.entity[world, pixel] != entity:
+                return False
+            if wp.dot(receivers.normal[world, pixel], normal) < SMOOTH_NORMAL:
+                return False
+    return nearly_equal(
+        diffuse[world, corner], diffuse[world, right], diffuse[world, below], diffuse[world, across]
+    ) and nearly_equal(glossy[world, corner], glossy[world, right], glossy[world, below], glossy[world, across])
+
+
+@wp.kernel(module="unique")
+def _refine(
+    first: int,
+    receivers: ReceiverTable,
+    width: int,
+    height: int,
+    turn: int,
+    stride: int,
+    turns: wp.array2d(dtype=wp.int32),  # (world, slot)
+    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+):
+    world, cell = wp.tid()
+    cell += first
+    columns = (width + stride - 1) / stride
+    x_0 = (cell % columns) * stride
+    y_0 = (cell / columns) * stride
+    corner = y_0 * width + x_0
+    smooth = x_0 + stride < width and y_0 + stride < height
+    if smooth:
+        smooth = is_smooth(receivers, diffuse, glossy, turns, world, corner, width, stride)
+    right = corner + stride
+    below = corner + stride * width
+    across = below + stride
+    half = wp.max(stride / 2, 1)
+    for y in range(wp.min(stride, height - y_0)):
+        for x in range(wp.min(stride, width - x_0)):
+            pixel = corner + y * width + x
+            if turns[world, pixel] == 0:
+                if smooth:
+                    u = float(x) / float(stride)
+                    v = float(y) / float(stride)
+                    diffuse[world, pixel] = (1.0 - v) * (
+                        (1.0 - u) * diffuse[world, corner] + u * diffuse[world, right]
+                    ) + v * ((1.0 - u) * diffuse[world, below] + u * diffuse[world, across])
+                    glossy[world, pixel] = (1.0 - v) * (
+                        (1.0 - u) * glossy[world, corner] + u * glossy[world, right]
+                    ) + v * ((1.0 - u) * glossy[world, below] + u * glossy[world, across])
+                    turns[world, pixel] = wp.static(INTERPOLATED)
+                elif x % half == 0 and y % half == 0:
+                    turns[world, pixel] = turn + 1
+
+
+def make_lattice(worlds: int, slots: int, width: int, height: int, device: wp.Device) -> Lattice:
+    """Room for the turns of `slots` receivers per world, the first width x height of which are pixels."""
+    return Lattice(wp.zeros((worlds, slots), dtype=wp.int32, device=device), width, height)
+
+
+def begin_lattice(lattice: Lattice, receivers: ReceiverTable, extra: wp.array, device: wp.Device) -> None:
+    """Gives the first turn to every fourth pixel and to edges. extra: int32 (world, pixel), not -1 on edge pixels."""
+    launch(_begin, lattice.turns.shape, [receivers, extra, lattice.width], [lattice.turns], device)
+
+
+def refine_lattice(
+    lattice: Lattice, turn: int, receivers: ReceiverTable, diffuse: wp.array, glossy: wp.array, device: wp.Device
+) -> None:
+    """Interpolates the smooth cells of a turn's lattice in place, and gives the next turn to pixels of the others."""
+    stride = STRIDES[turn - 1]
+    cells = -(-lattice.width // stride) * -(-lattice.height // stride)
+    inputs = [receivers, lattice.width, lattice.height, turn, stride, lattice.turns, diffuse, glossy]
+    launch(_refine, (lattice.turns.shape[0], cells), inputs, [], device)
