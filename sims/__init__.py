@@ -1,7 +1,7 @@
 """Simulations to render: bowling, falling, statues; `python -m sims.bowling` simulates and renders one.
 
-Each of the three modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]` and
-`lights()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the geoms that do are in
+Each of the three modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
+`lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the geoms that do are in
 group 3, which is not drawn.
 """
 
@@ -10,11 +10,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from sims.surfaces import Body
+
+if TYPE_CHECKING:
+    import warp_psf as psf
 
 # Collision geoms are in this group, which MuJoCo does not draw by default.
 HIDDEN_GROUP = 3
@@ -73,6 +77,17 @@ def draw_box(body: mujoco.MjsBody, name: str, low: tuple, high: tuple, material:
         mass=0,
         group=0,
     )
+
+
+def dimmed_studio(share: float, turn: float = 0.0) -> psf.Environment:
+    """The built-in studio at a share of its light, turned about z by `turn` radians: what fills the shadows of a key.
+
+    The studio alone lights a white floor to radiance 1; with an area light besides, that would be too bright.
+    """
+    import warp_psf as psf
+
+    studio = psf.load_environment("studio").rotated(turn)
+    return psf.Environment("dimmed studio", share * studio.radiance)
 
 
 def step_frames(

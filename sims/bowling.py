@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from sims import HIDDEN_GROUP, add_material, add_mesh, draw_box, draw_mesh, new_stage, step_frames
+from sims import HIDDEN_GROUP, add_material, add_mesh, dimmed_studio, draw_box, draw_mesh, new_stage, step_frames
 from sims.bodies import BALL_DIAMETER, INCH, ball, pin, pin_profile
 from sims.surfaces import revolve
+
+if TYPE_CHECKING:
+    import warp_psf as psf
 
 PIN_SPACING = 12 * INCH
 # Kilograms: 3 pounds 6 ounces and 15 pounds.
@@ -24,19 +28,19 @@ PIN_SLICE_SEGMENTS = 36
 # Time constant (s) and damping ratio of contacts: hard, pins spring back, the curtain at the back swallows the ball.
 LIVELY, DULL = (0.003, 0.25), (0.03, 1.6)
 # Where the ball starts, metres, and how it moves, m/s; it aims at the pocket beside the head pin.
-BALL_START = (-3.05, -0.3, BALL_DIAMETER / 2)
-BALL_SPEED, BALL_ANGLE = 3.0, math.radians(4.6)
+BALL_START = (-2.4, -0.25, BALL_DIAMETER / 2)
+BALL_SPEED, BALL_ANGLE = 2.4, math.radians(4.6)
 # Spin about the vertical, rad/s.
 BALL_SIDE_SPIN = 3.0
 
 
 def build() -> mujoco.MjModel:
     """Lane, side walls, curtain, rack and ball."""
-    spec = new_stage(position=(-2.75, -0.8, 0.56), target=(0.0, 0.05, 0.13), fovy=31)
-    add_material(spec, "lane", (0.72, 0.56, 0.4), gloss=0.15)
-    add_material(spec, "wall", (0.33, 0.36, 0.4))
-    add_material(spec, "curtain", (0.36, 0.2, 0.21))
-    add_material(spec, "pin", (0.93, 0.91, 0.86), gloss=0.3)
+    spec = new_stage(position=(-4.0, -1.9, 1.25), target=(0.2, 0.0, 0.14), fovy=15)
+    add_material(spec, "lane", (0.83, 0.68, 0.5), gloss=0.1)
+    add_material(spec, "wall", (0.3, 0.42, 0.46))
+    add_material(spec, "curtain", (0.36, 0.5, 0.54))
+    add_material(spec, "pin", (0.92, 0.91, 0.88), gloss=0.25)
     add_material(spec, "ball", (0.06, 0.12, 0.34), gloss=1.0)
     _add_lane(spec)
     add_mesh(spec, "pin", pin(rings=64, segments=54))
@@ -64,14 +68,19 @@ def states(model: mujoco.MjModel, frames_per_second: float = 30, duration: float
 
 
 def lights() -> tuple:
-    """A soft box above the pins."""
+    """A soft box to the left of the pins, so that their shadows fall to the right."""
     import warp_psf as psf
 
     return (
         psf.rectangle_light(
-            "soft box", 1.2, 0.8, radiance=(9.0, 8.2, 7.0), position=(-0.5, -0.8, 2.1), target=(0.3, 0.0, 0.0)
+            "soft box", 0.8, 0.8, radiance=(17.0, 15.8, 14.0), position=(-0.6, 1.9, 1.6), target=(0.3, 0.0, 0.0)
         ),
     )
+
+
+def environment() -> psf.Environment:
+    """A third as bright as the soft box."""
+    return dimmed_studio(0.35, turn=-math.pi / 2)
 
 
 def _add_lane(spec: mujoco.MjSpec) -> None:
@@ -141,4 +150,4 @@ def _add_ball(spec: mujoco.MjSpec) -> None:
 if __name__ == "__main__":
     from warp_psf.cli import run_simulation
 
-    run_simulation(build, states, name="bowling", camera="front", environment="studio", lights=lights())
+    run_simulation(build, states, name="bowling", camera="front", environment=environment(), lights=lights())

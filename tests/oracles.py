@@ -9,8 +9,12 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.bridge import build_scene, read_poses
 from warp_psf.device import find_device, launch
+from warp_psf.renderer import Renderer
 from warp_psf.scene.light import area_light_entities
 from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.receiver import make_receivers
+from warp_psf.shade.direct import shade_direct
+from warp_psf.shade.occlude import turn_occlusion
 
 # Rays start this far off the surface, metres: the models under test are centimetres to metres large.
 RAY_OFFSET = 1e-4
@@ -85,3 +89,110 @@ def traced_irradiance(
     ]
     launch(_gather_irradiance, (1, len(points)), inputs, [out], device)
     return out.numpy()
+
+
+# Scenes for tests
+
+
+def make_model(worldbody: str, header: str = "") -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """A model without lights, with the diffuse materials white and grey, in its initial state."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><visual><headlight active="0"/></visual><asset>'
+        '<material name="white" rgba="1 1 1 1" specular="0"/><material name="grey" rgba=".4 .4 .4 1" specular="0"/>'
+        f"</asset>{header}<worldbody>{worldbody}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def make_renderer(
+    worldbody: str, height: int = 1, width: int = 1, *, header: str = "", **options
+) -> tuple[Renderer, mujoco.MjData]:
+    """A renderer of such a model, updated with its initial state and free camera; rgba counts as linear."""
+    model, data = make_model(worldbody, header)
+    renderer = Renderer(model, height, width, **({"material_space": "linear"} | options))
+    renderer.update_scene(data)
+    return renderer, data
+
+
+def shade_points(renderer: Renderer, geom: str, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, ...]:
+    """What points [N, 3] on a geom with normals [N, 3] receive: irradiance and Phong radiance, float32 [N, 3] each.
+
+    In the state of the last `update_scene`, without the delta lights. The geom must not shadow itself.
+    """
+    device, count = renderer._device, len(points)
+    names = [entity.name for entity in renderer._scene.entities]
+    receivers = make_receivers((1, count), device)
+    receivers.entity.fill_(names.index(geom))
+    receivers.position.assign(np.asarray(points, np.float32)[None])
+    receivers.normal.assign(np.broadcast_to(normals, (1, count, 3)).astype(np.float32))
+    received = [wp.zeros((1, count), dtype=wp.vec3, device=device) for _ in range(2)]
+    turns = wp.full((1, count), 1, dtype=wp.int32, device=device)
+    turn_occlusion(renderer._occlusion, renderer._device_scene, device)
+    lights = (renderer._occlusion, renderer._lighting)
+    shade_direct(receivers, turns, 1, renderer._device_scene, *lights, *received, device)
+    return tuple(array.numpy()[0] for array in received)
+
+
+# Closed forms
+
+
+def sphere_form_factor(points: np.ndarray, normals: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
+    """The share [N] of the irradiance of a white sky that a sphere wholly above the horizon takes: (R/d)^2 cos."""
+    offset = center - points
+    distance = np.linalg.norm(offset, axis=1)
+    return (radius / distance) ** 2 * np.sum(offset * normals, axis=1) / distance
+
+
+def polygon_form_factor(points: np.ndarray, normals: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """The share [N] of the irradiance of a white sky that comes from a polygon [K, 3] wholly above the horizon.
+
+    Lambert's formula: 1/(2 pi) of the sum, over its edges, of the angle they subtend times the cosine between the
+    normal and that of the plane through the edge and the point. The polygon is counter-clockwise seen from the point.
+    """
+    toward = corners[None] - points[:, None]
+    toward = toward / np.linalg.norm(toward, axis=2, keepdims=True)
+    after = np.roll(toward, -1, axis=1)
+    across = np.cross(toward, after)
+    sine = np.linalg.norm(across, axis=2)
+    angle = np.arctan2(sine, np.sum(toward * after, axis=2))
+    cosine = np.einsum("nkx,nx->nk", across, np.broadcast_to(normals, points.shape)) / sine
+    return np.sum(angle * cosine, axis=1) / (2 * np.pi)
+
+
+def sphere_coverage(points: np.ndarray, center: np.ndarray, radius: float, order: int) -> np.ndarray:
+    """The SH vectors [N, order^2] of the directions that a sphere covers around points [N, 3]."""
+    offset = center - points
+    distance = np.linalg.norm(offset, axis=1)
+    return sh.zonal(sh.cap(np.arcsin(radius / distance), order), offset / distance[:, None])
+
+
+# NumPy twins, float64
+
+
+def chained_irradiance(light: np.ndarray, coverage: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Irradiance [N, 3] past one occluder by the papers' products on SH.
+
+    light: radiance [order^2, 3]. coverage: [N, order^2]. The cosine has one band more, and so have the products.
+    """
+    order = sh.order_of(len(light)) + 1
+    more = order * order - len(light)
+    visibility = -np.pad(coverage, ((0, 0), (0, more)))
+    visibility[:, 0] += np.sqrt(4 * np.pi)
+    cosine = sh.zonal(sh.clamped_cosine(order), np.broadcast_to(normals, (len(coverage), 3)))
+    received = sh.triple_product(visibility, cosine)
+    return received @ np.pad(light, ((0, more), (0, 0)))
+
+
+def multiplied_irradiance(light: np.ndarray, coverages: list[np.ndarray], normals: np.ndarray) -> np.ndarray:
+    """Irradiance [N, 3] past several occluders, each of coverage [N, order^2]: products at the quadrature's directions.
+
+    light: radiance [order^2, 3].
+    """
+    order = sh.order_of(len(light))
+    directions, weights = sphere.quadrature(sphere.QUADRATURE_POINTS[order])
+    basis = sh.evaluate(directions, order)
+    cosine = sh.zonal(sh.clamped_cosine(order + 1), normals) @ sh.evaluate(directions, order + 1).T
+    visible = np.prod([1 - coverage @ basis.T for coverage in coverages], axis=0)
+    return (weights * visible * cosine) @ (basis @ light)

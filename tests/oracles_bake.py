@@ -66,6 +66,13 @@ def cone_coverage(mesh: Mesh, points: np.ndarray, order: int, rays: int) -> np.n
     return vectors
 
 
+def latlong_coverage(mesh: Mesh, points: np.ndarray, order: int, rows: int) -> np.ndarray:
+    """Coverage vectors [N, order^2] at points [N, 3], by rows x rows rays of latitude and longitude, as the paper's."""
+    directions = sphere.latlong_directions(rows, rows).reshape(-1, 3)
+    covered = trace(mesh, points, directions) != 0
+    return sh.project(covered, directions, sphere.latlong_solid_angles(rows, rows).ravel(), order)
+
+
 def baked_samples(mesh: Mesh, shell: int, order: int, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """What the bake does for some samples of a shell: where it takes them [N, 3], vectors [N, order^2], and rays each.
 

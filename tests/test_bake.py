@@ -85,8 +85,8 @@ def solid_angle(vectors):
 @pytest.mark.parametrize(
     ("radii", "tolerance"),
     [
-        # On a shell: sampling (under 0.2 %), quantisation (0.3 % at most), and the bend of the functions between samples
-        # 5.6 degrees apart, up to (3 * 0.05)^2 / 2 = 1 % of the third band.
+        # On a shell: sampling (under 0.2 %), quantisation (0.3 % at most), and the bend of the functions between
+        # samples 5.6 degrees apart, up to (3 * 0.05)^2 / 2 = 1 % of the third band.
         ((1.2, 1.4, 2.0, 3.0, 6.4), 0.008),
         # Between the bounding sphere and the next shell coverage falls from a hemisphere to 45 % of one. The shape of
         # its boundary changes with it, which no mean of two vectors follows.
@@ -205,7 +205,7 @@ def test_an_open_mesh_bakes_a_usable_field(dome, bake):
     # Under the dome shells of a fifth of its radius follow one another.
     assert np.linalg.norm(error, axis=1).max() < 0.06 * FULL
     # Under the dome there is no sky.
-    top = np.flatnonzero((dome.vertices[:, 2] > 0.9))
+    top = np.flatnonzero(dome.vertices[:, 2] > 0.9)
     assert baked.visibility is not None
     assert baked.transfer.shape == baked.visibility.shape == (len(dome.vertices), 16)
     np.testing.assert_allclose(solid_angle(baked.visibility[top]), 2 * np.pi, rtol=1e-3)
@@ -249,6 +249,7 @@ def test_a_body_of_uniform_radiance_is_its_coverage(corner, monkeypatch):
     monkeypatch.setattr(body, "FINEST_RESOLUTION", 16)
     covered = psf.bake_mesh(corner, 2, use_cache=False).field
     shining = bake_radiance_field(corner, np.ones(len(corner.faces)), 2, use_cache=False)
+    assert covered is not None
     np.testing.assert_array_equal(covered.resolutions, shining.resolutions)
     # The nearest hit and any hit may disagree on a ray that passes along an edge; quantisation adds a step.
     points = corner.center + corner.radius * 1.3 * directions(200)
@@ -313,6 +314,7 @@ def test_progress_grows_to_one(corner, monkeypatch, tmp_path):
     again = []
     assert psf.bake_mesh(corner, 2, progress=again.append).field is not None
     assert again == [1.0]
+    assert baked.field is not None
     assert baked.field.resolutions.max() == 8
 
 

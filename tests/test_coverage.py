@@ -6,7 +6,8 @@ import warp as wp
 
 from warp_psf.basis import sh, sphere
 from warp_psf.device import find_device, launch
-from warp_psf.shade.coverage import basis_at_directions, make_coverage, quadrature_rows
+from warp_psf.shade.coverage import make_coverage
+from warp_psf.shade.directions import basis_at_directions, quadrature_rows
 
 # Directions of the brute-force projection: with 40,000 the projection of an indicator is good to about 1e-3.
 DIRECTIONS = sphere.fibonacci_cap(40_000)
@@ -39,7 +40,7 @@ def slab_kernel(request):
         points: wp.array(dtype=wp.vec3),
         half: wp.vec3,
         to_world: wp.mat33,
-        quadrature: wp.array(dtype=kit.values),
+        quadrature: wp.array(dtype=kit.half_values),
         slab_out: wp.array(dtype=kit.values),
         cap_out: wp.array(dtype=kit.values),
     ):
@@ -48,7 +49,7 @@ def slab_kernel(request):
         slab_out[item] = kit.slab_coverage(wp.transpose(to_world) * points[item], half, to_world, quadrature)
         toward = wp.normalize(-points[item])
         sine = wp.min(1.0 / wp.length(points[item]), 1.0)
-        cap_out[item] = kit.cap_coverage(kit.cosine_to(toward, quadrature), wp.sqrt(1.0 - sine * sine))
+        cap_out[item] = kit.cap_coverage(toward, wp.sqrt(1.0 - sine * sine), quadrature)
 
     def cover(points, half, to_world):
         outs = [wp.zeros(len(points), dtype=kit.values, device=device) for _ in range(2)]

@@ -13,12 +13,12 @@ import warp as wp
 from warp_psf.bake import BakedBody, bake_mesh, bake_radiance_field
 from warp_psf.bridge import build_scene, read_camera, read_delta_lights, read_poses
 from warp_psf.device import find_device
-from warp_psf.film.display import VIEWS, to_display
+from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
 from warp_psf.film.primary import aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import make_film, read_layers, resolve_pixels
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.geometry import upload_scene, write_poses
-from warp_psf.scene.light import DeltaLight, Light, area_light_entities
+from warp_psf.scene.light import Light, area_light_entities
 from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
 from warp_psf.shade.lattice import STRIDES, begin_lattice, make_lattice, refine_lattice
@@ -76,15 +76,14 @@ class Renderer:
         device: str | None = None,
         progress: Progress | None = None,
     ):
+        _check_model(model)
         _check_options(height, width, order, shading, exposure, view)
         self._model, self._height, self._width = model, int(height), int(width)
-        self._order, self._shading = order, shading
+        self._order, self._shading = int(order), shading
         self._exposure, self._view = exposure, view
         self._device = find_device(device)
         self._environment = load_environment(environment)
-        self._scene = build_scene(
-            model, material_space=material_space, lights=lights, model_lights=model_lights
-        )
+        self._scene = build_scene(model, material_space=material_space, lights=lights, model_lights=model_lights)
         self._upload(self._bake(progress or (lambda what, share: None)))
         self._depth_rendering = self._segmentation_rendering = False
         self._world_from_camera: np.ndarray | None = None
@@ -173,7 +172,7 @@ class Renderer:
             return picture
         if out.shape != picture.shape or out.dtype != picture.dtype:
             raise ValueError(
-                f"out is {out.dtype} {out.shape}; this picture is {picture.dtype} {picture.shape}: give an array like it"
+                f"out is {out.dtype} {out.shape}, the picture {picture.dtype} {picture.shape}; give an array like it"
             )
         np.copyto(out, picture)
         return out
@@ -211,6 +210,8 @@ class Renderer:
             self._closed = True
             del self._device_scene, self._surfaces, self._film, self._occlusion, self._lighting
             del self._delta_lights, self._received, self._lattice, self._vertices
+            if self._shading == "vertex":
+                del self._vertices_received, self._vertices_turns
 
     def __enter__(self) -> Renderer:
         return self
@@ -219,9 +220,14 @@ class Renderer:
         self.close()
 
     def _bake(self, progress: Progress) -> list[BakedBody]:
-        """Every mesh's baked body; those of entities that only shine are not needed as occluders."""
+        """Every mesh's baked body; one that only area lights have neither casts nor receives shadows."""
+        entities, lights = self._scene.entities, area_light_entities(self._scene)
+        casters = {entity.mesh for entity in entities[: len(entities) - len(lights)]}
         bodies = []
-        for mesh in self._scene.meshes:
+        for index, mesh in enumerate(self._scene.meshes):
+            if index not in casters:
+                bodies.append(BakedBody(None, None, None))
+                continue
 
             def report(share: float, name: str = mesh.name) -> None:
                 progress(f"baking {name}", share)
@@ -234,7 +240,8 @@ class Renderer:
         area_lights = area_light_entities(scene)
         fields = [bodies[entity.mesh].field for entity in scene.entities]
         for light, entity in area_lights:
-            if fields[entity] is not None:
+            fields[entity] = None
+            if light.mesh.slab is None and light.mesh.sphere is None:
                 radiance = np.ones(len(light.mesh.faces), np.float32)
                 fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
         self._casts = [entity < len(scene.entities) - len(area_lights) for entity in range(len(scene.entities))]
@@ -251,9 +258,8 @@ class Renderer:
         if self._environment is not None:
             write_environment(self._lighting, self._environment.project(order))
             background = self._environment.radiance
-        deltas = sum(isinstance(light, DeltaLight) for light in scene.lights)
         reach = DIRECTIONAL_REACH * float(self._model.stat.extent)
-        self._delta_lights = make_delta_lights(deltas, 1, reach, device)
+        self._delta_lights = make_delta_lights(scene, 1, reach, device)
 
         antialias = self._model.vis.quality.offsamples > 1
         self._surfaces = make_surfaces(1, self._width, self._height, antialias, device)
@@ -329,9 +335,16 @@ class Renderer:
             raise RuntimeError("the renderer is closed; make a new one")
 
 
+def _check_model(model: mujoco.MjModel) -> None:
+    if not isinstance(model, mujoco.MjModel):
+        raise TypeError(
+            f"model is a {type(model).__name__}; give a mujoco.MjModel, for example mujoco.MjModel.from_xml_path(path)"
+        )
+
+
 def _check_options(height: int, width: int, order: int, shading: str, exposure: float, view: str) -> None:
     for name, size in (("height", height), ("width", width)):
-        if int(size) != size or size < 1:
+        if not np.isfinite(size) or int(size) != size or size < 1:
             raise ValueError(f"{name} is {size}; give a whole number of pixels, at least 1")
     if height * width > MOST_PIXELS:
         raise ValueError(f"a picture of {width} x {height} pixels is too large; give at most {MOST_PIXELS} pixels")
@@ -341,5 +354,5 @@ def _check_options(height: int, width: int, order: int, shading: str, exposure: 
         raise ValueError(f"shading is {shading!r}; choose {' or '.join(map(repr, SHADINGS))}")
     if view not in VIEWS:
         raise ValueError(f"view is {view!r}; choose {' or '.join(map(repr, VIEWS))}")
-    if not np.isfinite(exposure):
-        raise ValueError(f"exposure is {exposure}; give a finite number of stops")
+    if not abs(exposure) <= LARGEST_EXPOSURE:
+        raise ValueError(f"exposure is {exposure}; give a number of stops within {LARGEST_EXPOSURE:g} of 0")

@@ -29,7 +29,7 @@ from warp_psf.field.store import store_key
 from warp_psf.scene.mesh import Mesh
 
 # Raised whenever the same settings would give other numbers, so that older files on disk are not used.
-BAKE_VERSION = 2
+BAKE_VERSION = 3
 ORDERS = range(2, 7)
 # Samples that left the solid at points this close, in bounding radii, left it at the same point.
 SAME_POINT = 1.0e-5

@@ -17,12 +17,12 @@ from warp_psf.device import launch
 
 # Rays per sample: (from how many bounding radii on, rays). Within the bounding sphere they cover all directions;
 # beyond, only its cone. The error of a coefficient goes as (solid angle of the cone) / (rays)^(3/4): it falls outwards.
-RAYS = ((0.0, 1536), (1.0, 768), (2.0, 384), (3.0, 192))
+RAYS = ((0.0, 2048), (1.0, 768), (2.0, 384), (3.0, 192))
 # Rays that decide whether a point is inside the solid: those that leave more layers than they enter say so.
 RAYS_INSIDE_TEST = 24
 # The share of them that must say so. In a closed mesh all or none do, except that two flush faces count as one: then
-# up to half of the rays say so outside, and fewer than all inside. An open mesh has no inside, yet who is all but walled
-# in by back faces is as good as inside; a receiver under a dome or in a cup must not be.
+# up to half of the rays say so outside, and fewer than all inside. An open mesh has no inside, yet who is all but
+# walled in by back faces is as good as inside; a receiver under a dome or in a cup must not be.
 LEAST_SHARE_CLOSED = 0.55
 LEAST_SHARE_OPEN = 0.9
 # How far a ray's origin leaves the surface, in bounding radii: enough for float32, too little to be seen.

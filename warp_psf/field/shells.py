@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_psf.basis import sh
+from warp_psf.basis import sh, sphere
 
 SHELL_COUNT = 32
 # The radius of shell c is SHELL_SPACING * (1 + c) * (radius of the bounding sphere): Tamura 2006, section 6.
@@ -27,8 +27,8 @@ COARSEST_RESOLUTION = 8
 FIRST_OUTER_SHELL = 4
 # Right outside the bounding sphere, coverage falls faster where the body reaches the sphere: above the surface of a
 # sphere it goes as the square root of the height, the power 1/2 of the weight, above empty space as the weight itself.
-# In between, the power is 1 - CONTACT_POWER * (covered share of the hemisphere towards the body). Measured against ray
-# casting between shells 4 and 5 of six bodies, this takes 10 % to 40 % off the error, and adds to no body's.
+# In between, the power is 1 - CONTACT_POWER * (covered share of the hemisphere towards the body). Compared with ray
+# casting between shells 4 and 5 of six bodies, the RMS error fell most for the roundest, and grew by a tenth nowhere.
 CONTACT_POWER = 0.5
 # The covered share of a hemisphere, from the first coefficient of its coverage.
 HEMISPHERE_SHARE = math.sqrt(4 * math.pi) / (2 * math.pi)
@@ -66,6 +66,10 @@ class ShadowField:
         """The vectors as float32 [samples, coefficients]."""
         shell = np.repeat(np.arange(SHELL_COUNT), self.resolutions.astype(np.int64) ** 2)
         return self.minimum[shell] + self.step[shell] * self.codes
+
+    def lookup(self, points_body: np.ndarray) -> np.ndarray:
+        """The vectors at points of the body's frame [N, 3], metres, float64 [N, coefficients]."""
+        return lookup(self, points_body)
 
 
 def shell_radii(radius: float) -> np.ndarray:
@@ -122,8 +126,16 @@ def make_fields(order: int) -> SimpleNamespace:
         center: wp.array(dtype=wp.vec3)  # (field), in the body's frame
         radius: wp.array(dtype=wp.float32)  # (field)
 
+    @wp.func_native(_blend_snippet(order))
+    def blend(
+        samples: wp.array(dtype=vec), near: wp.vec4i, near_shares: wp.vec4, far: wp.vec4i, far_shares: wp.vec4
+    ) -> vec:
+        """The sum of four samples of one shell and four of the next."""
+        ...
+
     @wp.func
-    def interpolate_shell(table: FieldTable, first: int, resolution: int, theta: float, phi: float) -> vec:
+    def nearest_four(first: int, resolution: int, theta: float, phi: float):
+        """The samples around a direction on a shell, and their bilinear shares."""
         # Continuous sample coordinates: sample (s, t) stands at s + 1/2, t + 1/2.
         row = theta * float(resolution) - 0.5
         column = phi * float(resolution) - 0.5
@@ -134,27 +146,29 @@ def make_fields(order: int) -> SimpleNamespace:
         mask = resolution - 1  # resolutions are powers of two: `& mask` wraps the azimuth, also of -1
         half = resolution / 2
         # A row beyond a pole is the same row seen from the other side: half a turn away in azimuth.
-        row_0 = wp.max(row_below, 0)
-        row_1 = wp.min(row_below + 1, mask)
-        turn_0 = wp.where(row_below < 0, half, 0)
-        turn_1 = wp.where(row_below + 1 > mask, half, 0)
-        base_0 = first + row_0 * resolution
-        base_1 = first + row_1 * resolution
-        return (
-            ((1.0 - u) * (1.0 - v)) * table.samples[base_0 + ((column_below + turn_0) & mask)]
-            + ((1.0 - u) * v) * table.samples[base_0 + ((column_below + 1 + turn_0) & mask)]
-            + (u * (1.0 - v)) * table.samples[base_1 + ((column_below + turn_1) & mask)]
-            + (u * v) * table.samples[base_1 + ((column_below + 1 + turn_1) & mask)]
+        base_0 = first + wp.max(row_below, 0) * resolution
+        base_1 = first + wp.min(row_below + 1, mask) * resolution
+        column_0 = column_below + wp.where(row_below < 0, half, 0)
+        column_1 = column_below + wp.where(row_below + 1 > mask, half, 0)
+        corners = wp.vec4i(
+            base_0 + (column_0 & mask),
+            base_0 + ((column_0 + 1) & mask),
+            base_1 + (column_1 & mask),
+            base_1 + ((column_1 + 1) & mask),
         )
+        return corners, wp.vec4((1.0 - u) * (1.0 - v), (1.0 - u) * v, u * (1.0 - v), u * v)
 
     @wp.func
     def lookup_coverage(table: FieldTable, field: int, p_body: wp.vec3) -> vec:
         """The vector at a point of the body's frame: bilinear on the two nearest shells, then between them."""
         offset = p_body - table.center[field]
         distance = wp.length(offset)
-        # atan2, because acos has no digits left near the poles; the centre itself has no direction, and any will do.
-        theta = wp.atan2(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]), offset[2]) * wp.static(1.0 / math.pi)
-        phi = wp.atan2(offset[1], offset[0]) * wp.static(0.5 / math.pi)
+        # From both legs of the angle, because acos has no digits left near the poles; the centre itself has no
+        # direction, and any will do.
+        level = wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1])
+        theta = sphere.angle_of(level, offset[2], distance) * wp.static(1.0 / math.pi)
+        phi = sphere.angle_of(wp.abs(offset[1]), offset[0], level) * wp.static(0.5 / math.pi)
+        phi = wp.where(offset[1] < 0.0, -phi, phi)
 
         # In units of the spacing, shell c has radius c + 1.
         radius = distance / (table.radius[field] * wp.static(SHELL_SPACING))
@@ -162,11 +176,11 @@ def make_fields(order: int) -> SimpleNamespace:
         clamped = wp.clamp(radius, 1.0, last)
         inner = wp.min(int(clamped) - 1, wp.static(SHELL_COUNT - 2))
         r_0 = float(inner + 1)
-        nearer = interpolate_shell(
-            table, table.shell_first[field, inner], table.shell_resolution[field, inner], theta, phi
+        near, near_shares = nearest_four(
+            table.shell_first[field, inner], table.shell_resolution[field, inner], theta, phi
         )
-        farther = interpolate_shell(
-            table, table.shell_first[field, inner + 1], table.shell_resolution[field, inner + 1], theta, phi
+        far, far_shares = nearest_four(
+            table.shell_first[field, inner + 1], table.shell_resolution[field, inner + 1], theta, phi
         )
         weight = clamped - r_0
         if inner >= wp.static(FIRST_OUTER_SHELL):
@@ -174,13 +188,29 @@ def make_fields(order: int) -> SimpleNamespace:
             r_1 = r_0 + 1.0
             weight = (1.0 - (r_0 * r_0) / (clamped * clamped)) / (1.0 - (r_0 * r_0) / (r_1 * r_1))
         if inner == wp.static(FIRST_OUTER_SHELL):
-            share = wp.clamp(wp.static(HEMISPHERE_SHARE) * nearer[0], 0.0, 1.0)
+            constant = (
+                near_shares[0] * table.samples[near[0]][0]
+                + near_shares[1] * table.samples[near[1]][0]
+                + near_shares[2] * table.samples[near[2]][0]
+                + near_shares[3] * table.samples[near[3]][0]
+            )
+            share = wp.clamp(wp.static(HEMISPHERE_SHARE) * constant, 0.0, 1.0)
             weight = wp.pow(weight, 1.0 - wp.static(CONTACT_POWER) * share)
         beyond = last / wp.max(radius, last)
         scale = beyond * beyond
-        return (scale * (1.0 - weight)) * nearer + (scale * weight) * farther
+        return blend(table.samples, near, (scale * (1.0 - weight)) * near_shares, far, (scale * weight) * far_shares)
 
     return SimpleNamespace(FieldTable=FieldTable, lookup_coverage=lookup_coverage, vec=vec)
+
+
+def _blend_snippet(order: int) -> str:
+    """C++ that reads the eight samples and sums them in one pass."""
+    terms = [f"{shell}_shares[{k}] * samples.data[{shell}[{k}]][i]" for shell in ("near", "far") for k in range(4)]
+    return f"""
+    wp::vec_t<{order * order}, float> sum;
+    for (int i = 0; i < {order * order}; ++i) sum[i] = {" + ".join(terms)};
+    return sum;
+    """
 
 
 def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):

@@ -4,8 +4,8 @@ Every pixel traces its centre. Where neighbouring pixels see different surfaces,
 places, its samples are grouped by surface, and each group becomes a receiver of its own with the group's share as its
 weight: edges are antialiased and nothing is shaded twice.
 
-The receivers of a world are numbered so that slot p < pixels is the centre of pixel p (or its first group), and
-EXTRA_GROUPS further slots belong to each edge pixel, in the order of the pixels.
+The receivers of a world are numbered so that slot p < pixels is the centre of pixel p, with the share of the group
+that is like it, and EXTRA_GROUPS further slots belong to each edge pixel, in the order of the pixels.
 """
 
 import math
@@ -213,7 +213,8 @@ def _trace_edges(
         normals = wp.matrix(shape=(4, 3), dtype=float)
         normals[0] = receivers.normal[world, pixel]
         weights = wp.vec4()
-        groups = int(wp.where(entities[0] >= 0, 1, 0))
+        # Group 0 is what the centre sees, be it nothing: depth and segmentation are the centre's.
+        groups = int(1)
         x = float(pixel % camera.width)
         y = float(pixel / camera.width)
         samples = int(wp.static(SAMPLES))  # a variable keeps the loop from being unrolled
@@ -235,16 +236,16 @@ def _trace_edges(
                     found = groups
                     entities[found] = hit.entity
                     normals[found] = hit.normal
-                    if found == 0:
-                        store_hit(receivers, world, pixel, hit, 0.0)
-                    else:
-                        store_hit(receivers, world, slot + found - 1, hit, 0.0)
+                    store_hit(receivers, world, slot + found - 1, hit, 0.0)
                     groups += 1
-                weights[wp.max(found, 0)] += share
+                if found < 0:
+                    # No room for another entity: a group that there is stands for it.
+                    found = wp.where(entities[0] >= 0, 0, 1)
+                weights[found] += share
         receivers.weight[world, pixel] = weights[0]
         for group in range(1, groups):
             receivers.weight[world, slot + group - 1] = weights[group]
-        for group in range(wp.max(groups, 1), wp.static(EXTRA_GROUPS + 1)):
+        for group in range(groups, wp.static(EXTRA_GROUPS + 1)):
             receivers.entity[world, slot + group - 1] = -1
 
 

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.basis import sphere
 from warp_psf.device import launch
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.light import DeltaLight
 from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.scene import Scene
 
 # Shadow rays towards a bulb with a radius. When the first few, spread over the bulb, agree, the rest are left out.
 BULB_RAYS = 48
@@ -36,16 +38,24 @@ class DeltaLightTable:
     reach: wp.array2d(dtype=wp.float32)  # metres
     radius: wp.array2d(dtype=wp.float32)  # of the bulb, metres
     casts: wp.array2d(dtype=wp.bool)
+    shadows_itself: wp.array(dtype=wp.bool)  # (entity): False for convex and for flat bodies
 
 
 @wp.func
 def is_blocked(
-    world: int, own: int, p: wp.vec3, toward: wp.vec3, geometry: GeometryTable, poses: PoseTable, casts: wp.array(dtype=wp.bool)
+    world: int,
+    own: int,
+    p: wp.vec3,
+    toward: wp.vec3,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    casts: wp.array(dtype=wp.bool),  # (entity)
+    shadows_itself: wp.array(dtype=wp.bool),  # (entity)
 ) -> bool:
-    """Whether anything stands on the segment from p to p + toward. A convex body does not shadow itself."""
+    """Whether anything stands on the segment from p to p + toward, which starts on the entity `own`."""
     length_squared = wp.dot(toward, toward)
     for entity in range(geometry.entity_mesh.shape[0]):
-        if casts[entity] and not (entity == own and geometry.convex[entity]):
+        if casts[entity] and (entity != own or shadows_itself[entity]):
             position = poses.position[world, entity]
             rotation = poses.rotation[world, entity]
             radius = geometry.radius[entity]
@@ -93,7 +103,7 @@ def _add_delta_lights(
     n = receivers.normal[world, receiver]
     p = receivers.position[world, receiver]
     origin = p
-    if not geometry.convex[entity]:
+    if lights.shadows_itself[entity]:
         origin = p + (wp.static(SHADOW_OFFSET) * geometry.radius[entity]) * n
     exponent = geometry.exponent[entity]
     view = wp.normalize(eye[world] - p)
@@ -123,8 +133,7 @@ def _add_delta_lights(
                 radius = lights.radius[world, light]
                 if radius > 0.0 and kind != wp.static(KINDS["directional"]):
                     # A disc that faces the receiver stands for the bulb.
-                    across = wp.normalize(wp.cross(unit, wp.where(wp.abs(unit[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))))
-                    up = wp.cross(unit, across)
+                    disc = sphere.frame_of(unit)
                     open_rays = int(0)
                     cast = int(0)
                     rays = int(wp.static(BULB_RAYS))
@@ -133,16 +142,21 @@ def _add_delta_lights(
                         place = bulb_point((ray * 29) % wp.static(BULB_RAYS), wp.static(BULB_RAYS))
                         decided = ray >= wp.static(FIRST_BULB_RAYS) and (open_rays == 0 or open_rays == cast)
                         if not decided:
-                            aimed = toward + radius * (place[0] * across + place[1] * up)
+                            aimed = toward + radius * (disc * wp.vec3(place[0], place[1], 0.0))
                             cast += 1
-                            if not is_blocked(world, entity, origin, aimed, geometry, poses, casts):
+                            if not is_blocked(
+                                world, entity, origin, aimed, geometry, poses, casts, lights.shadows_itself
+                            ):
                                 open_rays += 1
                     lit = float(open_rays) / float(cast)
-                elif is_blocked(world, entity, origin, toward, geometry, poses, casts):
+                elif is_blocked(world, entity, origin, toward, geometry, poses, casts, lights.shadows_itself):
                     lit = 0.0
             diffuse += (wp.static(math.pi) * strength * lit * cosine) * lights.diffuse[world, light]
-            lobe = wp.static(0.5) * (exponent + 2.0) * wp.pow(wp.max(wp.dot(mirrored, unit), 0.0), exponent)
-            glossy += (strength * lit * lobe) * lights.specular[world, light]
+            aligned = wp.dot(mirrored, unit)
+            # Behind the mirror direction there is nothing, though 0^0 is 1.
+            if aligned > 0.0:
+                lobe = 0.5 * (exponent + 2.0) * wp.pow(aligned, exponent)
+                glossy += (strength * lit * lobe) * lights.specular[world, light]
     diffuse_out[world, receiver] = diffuse_out[world, receiver] + diffuse
     glossy_out[world, receiver] = glossy_out[world, receiver] + glossy
 
@@ -155,10 +169,13 @@ class DeltaState:
     far: float  # metres: how far a directional light's shadow rays reach
 
 
-def make_delta_lights(count: int, worlds: int, far: float, device: wp.Device) -> DeltaState:
-    """Room for at most `count` delta lights in each of `worlds` worlds."""
+def make_delta_lights(scene: Scene, worlds: int, far: float, device: wp.Device) -> DeltaState:
+    """Room for the delta lights of a scene in each of `worlds` worlds. far: as in `DeltaState`."""
     table = DeltaLightTable()
-    shape = (worlds, count)
+    shape = (worlds, sum(isinstance(light, DeltaLight) for light in scene.lights))
+    shapes = [scene.meshes[entity.mesh] for entity in scene.entities]
+    shadows_itself = [not mesh.convex and mesh.slab is None for mesh in shapes]
+    table.shadows_itself = wp.array(shadows_itself, dtype=wp.bool, device=device)
     table.kind = wp.zeros(shape, dtype=wp.int32, device=device)
     for name in ("position", "direction", "diffuse", "specular", "ambient", "attenuation"):
         setattr(table, name, wp.zeros(shape, dtype=wp.vec3, device=device))
@@ -175,9 +192,7 @@ def write_delta_lights(state: DeltaState, worlds: Sequence[Sequence[DeltaLight]]
     count = table.kind.shape[1]
 
     def collect(value, filler) -> np.ndarray:
-        return np.array(
-            [[value(light) for light in lights] + [filler] * (count - len(lights)) for lights in worlds]
-        )
+        return np.array([[value(light) for light in lights] + [filler] * (count - len(lights)) for lights in worlds])
 
     dark = np.zeros(3)
     table.kind.assign(collect(lambda light: KINDS[light.kind], 0).astype(np.int32))
@@ -204,7 +219,7 @@ def add_delta_lights(
     glossy: wp.array,
     device: wp.Device,
 ) -> None:
-    """Adds the delta lights to every receiver's irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, slot)."""
+    """Adds the delta lights to the receivers' irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, slot)."""
     if lights.table.kind.shape[1] == 0:
         return
     inputs = [receivers, scene.geometry, scene.poses, casts, eye, lights.table, lights.far]

@@ -8,38 +8,32 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_psf.basis import sh, sphere
+from warp_psf.basis import sh
 from warp_psf.device import launch
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
-from warp_psf.shade.coverage import basis_at_directions
+from warp_psf.shade.directions import basis_at_directions, quadrature_weights
 from warp_psf.shade.occlude import OcclusionState, make_occlude
-
-# Sums over directions may be taken in any order, which lets a CPU add sixteen at a time; the order is fixed by the
-# compiled code, so equal input still gives equal bits.
-FAST_SUMS = f"{wp.config.cpu_compiler_flags} -mreassociate -fno-signed-zeros"
-
 
 @cache
 def make_direct(order: int) -> SimpleNamespace:
     """The kernel and tables of direct light on `order` bands."""
     kit = make_occlude(order)
-    vec, values = kit.vec, kit.values
+    vec, values, half_values = kit.vec, kit.values, kit.half_values
     Occlusion = kit.Occlusion
+    profile = kit.profile
     # The closed forms of the transfer are not stored, so they may have a band more than the fields: the clamped
     # cosine's last large coefficient is that of l = 4. The quadrature is exact for it.
-    cosine_lobe = [float(c) for c in lobe_polynomial(sh.clamped_cosine(order + 1))]
-    hemisphere = [float(c) for c in lobe_polynomial(sh.cap(np.pi / 2, order))]
-    lobe_degree = len(cosine_lobe) - 1
-    hemisphere_degree = len(hemisphere) - 1
+    cosine_profile = profile(*legendre_series(sh.clamped_cosine(order + 1)))
 
     @wp.struct
     class Lighting:
         """Lights and what receives them."""
 
         environment: wp.array2d(dtype=values)  # (world, channel): radiance times quadrature weight
+        weights: wp.array(dtype=values)  # (1): of the quadrature
         light_entity: wp.array(dtype=wp.int32)  # (area light)
         light_radiance: wp.array2d(dtype=wp.vec3)  # (world, area light)
         light_facing: wp.array(dtype=wp.vec3)  # (area light): front of a flat one in its frame, else zero
@@ -47,11 +41,11 @@ def make_direct(order: int) -> SimpleNamespace:
         transfer: wp.array(dtype=vec)  # (transfer vertex), in the entity's frame
         self_visibility: wp.array(dtype=vec)  # (transfer vertex)
         first_transfer: wp.array(dtype=wp.int32)  # (entity): -1 for convex bodies
-        lobe: wp.array2d(dtype=wp.float32)  # (entity, power): Phong lobe as a polynomial of the cosine
+        lobe: wp.array(dtype=profile)  # (entity): Phong lobe, coefficients of Legendre polynomials
 
     @wp.func
     def interpolate(
-        stored: wp.array(dtype=vec), start: int, corners: wp.vec3i, uv: wp.vec2, rows: wp.array(dtype=values)
+        stored: wp.array(dtype=vec), start: int, corners: wp.vec3i, uv: wp.vec2, rows: wp.array(dtype=half_values)
     ) -> values:
         return kit.at_directions(
             uv[0] * stored[start + corners[0]]
@@ -60,28 +54,7 @@ def make_direct(order: int) -> SimpleNamespace:
             rows,
         )
 
-    @wp.func
-    def clamped_cosine(cosine: values) -> values:
-        total = values(wp.static(cosine_lobe[lobe_degree]))
-        for k in range(wp.static(lobe_degree)):
-            total = wp.cw_mul(total, cosine) + values(wp.static(cosine_lobe[lobe_degree - 1 - k]))
-        return total
-
-    @wp.func
-    def upper_half(cosine: values) -> values:
-        total = values(wp.static(hemisphere[hemisphere_degree]))
-        for k in range(wp.static(hemisphere_degree)):
-            total = wp.cw_mul(total, cosine) + values(wp.static(hemisphere[hemisphere_degree - 1 - k]))
-        return total
-
-    @wp.func
-    def phong(cosine: values, entity: int, lobe: wp.array2d(dtype=wp.float32)) -> values:
-        total = values(lobe[entity, wp.static(lobe_degree)])
-        for k in range(wp.static(lobe_degree)):
-            total = wp.cw_mul(total, cosine) + values(lobe[entity, wp.static(lobe_degree) - 1 - k])
-        return total
-
-    @wp.kernel(module="unique", module_options={"cpu_compiler_flags": FAST_SUMS})
+    @wp.kernel(module="unique")
     def shade_receivers(
         first: int,
         receivers: ReceiverTable,
@@ -102,7 +75,6 @@ def make_direct(order: int) -> SimpleNamespace:
         p = receivers.position[world, receiver]
         n = receivers.normal[world, receiver]
         rows = o.rows[world, entity]
-        own_cosine = kit.cosine_to(n, o.quadrature)
         start = lighting.first_transfer[entity]
         mesh = geometry.entity_mesh[entity]
         corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, receiver]]
@@ -111,33 +83,33 @@ def make_direct(order: int) -> SimpleNamespace:
         if start >= 0:
             transfer = interpolate(lighting.transfer, start, corners, uv, rows)
         else:
-            transfer = clamped_cosine(own_cosine)
+            transfer = kit.zonal_at_directions(wp.static(cosine_profile), n, o.quadrature)
 
         glossy = wp.max(geometry.specular[entity]) > 0.0
         lobe = values()
         if glossy:
             view = wp.normalize(lighting.eye[world] - p)
             mirrored = 2.0 * wp.dot(n, view) * n - view
-            lobe = phong(kit.cosine_to(mirrored, o.quadrature), entity, lighting.lobe)
+            lobe = kit.zonal_at_directions(lighting.lobe[entity], mirrored, o.quadrature)
             if start >= 0:
                 lobe = wp.cw_mul(lobe, interpolate(lighting.self_visibility, start, corners, uv, rows))
             else:
-                lobe = wp.cw_mul(lobe, upper_half(own_cosine))
+                lobe = wp.cw_mul(lobe, kit.cap_coverage(n, 0.0, o.quadrature))
 
         visible = kit.visibility_at(world, entity, p, n, geometry, poses, o)
         received = wp.cw_mul(visible, transfer)
         diffuse = wp.vec3(
-            wp.dot(lighting.environment[world, 0], received),
-            wp.dot(lighting.environment[world, 1], received),
-            wp.dot(lighting.environment[world, 2], received),
+            kit.sum_of_products(lighting.environment[world, 0], received),
+            kit.sum_of_products(lighting.environment[world, 1], received),
+            kit.sum_of_products(lighting.environment[world, 2], received),
         )
         reflected = wp.vec3()
         if glossy:
             received = wp.cw_mul(visible, lobe)
             reflected = wp.vec3(
-                wp.dot(lighting.environment[world, 0], received),
-                wp.dot(lighting.environment[world, 1], received),
-                wp.dot(lighting.environment[world, 2], received),
+                kit.sum_of_products(lighting.environment[world, 0], received),
+                kit.sum_of_products(lighting.environment[world, 1], received),
+                kit.sum_of_products(lighting.environment[world, 2], received),
             )
 
         for light in range(lighting.light_entity.shape[0]):
@@ -163,12 +135,12 @@ def make_direct(order: int) -> SimpleNamespace:
                     o.quadrature,
                 )
                 visible = kit.visibility_before(world, entity, shining, p, n, geometry, poses, o)
-                weighted = wp.cw_mul(wp.cw_mul(seen, visible), o.quadrature[3])
+                weighted = wp.cw_mul(wp.cw_mul(seen, visible), lighting.weights[0])
                 radiance = lighting.light_radiance[world, light]
                 # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
-                diffuse += wp.max(wp.dot(weighted, transfer), 0.0) * radiance
+                diffuse += wp.max(kit.sum_of_products(weighted, transfer), 0.0) * radiance
                 if glossy:
-                    reflected += wp.max(wp.dot(weighted, lobe), 0.0) * radiance
+                    reflected += wp.max(kit.sum_of_products(weighted, lobe), 0.0) * radiance
 
         zero = wp.vec3()
         diffuse_out[world, receiver] = wp.max(diffuse, zero)
@@ -177,13 +149,9 @@ def make_direct(order: int) -> SimpleNamespace:
     return SimpleNamespace(**vars(kit), Lighting=Lighting, shade_receivers=shade_receivers)
 
 
-def lobe_polynomial(profile: np.ndarray) -> np.ndarray:
-    """Ascending coefficients, in the cosine to the axis, of a zonal function with the profile f_l, float64 [order]."""
-    bands = np.arange(len(profile))
-    polynomial = np.zeros(len(profile))
-    trimmed = np.polynomial.legendre.leg2poly(profile * np.sqrt((2 * bands + 1) / (4 * np.pi)))
-    polynomial[: len(trimmed)] = trimmed
-    return polynomial
+def legendre_series(zonal: np.ndarray) -> np.ndarray:
+    """A zonal function's coefficients f_l -> those of Legendre polynomials of the cosine to its axis, [order]."""
+    return zonal * np.sqrt((2 * np.arange(len(zonal)) + 1) / (4 * np.pi))
 
 
 @dataclass(frozen=True)
@@ -210,6 +178,8 @@ def upload_lighting(
     kit = make_direct(order)
     table = kit.Lighting()
     table.environment = wp.zeros((worlds, 3), dtype=kit.values, device=device)
+    weights = quadrature_weights(order).astype(np.float32)
+    table.weights = wp.array(weights[None], dtype=kit.values, device=device)
     table.light_entity = wp.array([entity for entity, _ in lights], dtype=wp.int32, device=device)
     radiance = np.array([radiance for _, radiance in lights], np.float32).reshape(1, -1, 3)
     table.light_radiance = wp.array(np.repeat(radiance, worlds, axis=0), dtype=wp.vec3, device=device)
@@ -227,8 +197,8 @@ def upload_lighting(
         total += 0 if pair is None else len(pair[0])
     first = [starts[entity.mesh] for entity in scene.entities]
     table.first_transfer = wp.array(first, dtype=wp.int32, device=device)
-    lobes = [lobe_polynomial(sh.phong_lobe(entity.material.exponent, order + 1)) for entity in scene.entities]
-    table.lobe = wp.array(np.array(lobes, np.float32).reshape(-1, order + 1), dtype=wp.float32, ndim=2, device=device)
+    lobes = [legendre_series(sh.phong_lobe(entity.material.exponent, order + 1)) for entity in scene.entities]
+    table.lobe = wp.array(np.array(lobes, np.float32).reshape(-1, order + 1), dtype=kit.profile, device=device)
     return DirectState(order, table)
 
 
@@ -236,7 +206,7 @@ def write_environment(state: DirectState, coefficients: np.ndarray) -> None:
     """Sets the environment of every world: radiance on SH, float64 [order^2, 3]."""
     order = state.order
     values = basis_at_directions(order) @ coefficients
-    weighted = sphere.quadrature(sphere.QUADRATURE_POINTS[order])[1][:, None] * values
+    weighted = quadrature_weights(order)[:, None] * values
     worlds = state.table.environment.shape[0]
     state.table.environment.assign(np.repeat(weighted.T.astype(np.float32)[None], worlds, axis=0))
 

@@ -14,14 +14,8 @@ from warp_psf.field.shells import ShadowField, upload_fields
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
-from warp_psf.shade.coverage import (
-    FIELD_SHAPE,
-    NO_SHAPE,
-    SLAB_SHAPE,
-    SPHERE_SHAPE,
-    make_coverage,
-    quadrature_rows,
-)
+from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
+from warp_psf.shade.directions import quadrature_rows
 
 # An occluder whose bounding sphere could take less than this share of a diffuse receiver's light is left out.
 # Seen face-on a sphere of radius R at distance d takes (R/d)^2; a two-hundredth of an 8-bit step per occluder.
@@ -35,7 +29,7 @@ SLAB_HORIZON = 1.0e-5
 def make_occlude(order: int) -> SimpleNamespace:
     """Device functions for `order` bands: `visibility_at` and `visibility_before`, and their tables."""
     kit = make_coverage(order)
-    values = kit.values
+    values, half_values = kit.values, kit.half_values
     OccluderTable, FieldTable = kit.OccluderTable, kit.FieldTable
     evaluate = sh.make_sh(order).evaluate
 
@@ -45,8 +39,9 @@ def make_occlude(order: int) -> SimpleNamespace:
 
         occluders: OccluderTable
         fields: FieldTable
-        rows: wp.array3d(dtype=values)  # (world, entity, coefficient): the entity's y_k at the world's directions
-        quadrature: wp.array(dtype=values)  # x, y, z, weight of the directions
+        # (world, entity, coefficient): the entity's y_k at the first half of the world's directions
+        rows: wp.array3d(dtype=half_values)
+        quadrature: wp.array(dtype=half_values)  # x, y, z of the first half of the directions
 
     @wp.func
     def matters(
@@ -236,13 +231,13 @@ def upload_occlusion(
     occluders.slab_half = wp.array(np.array([slab[2] for slab in slabs]), dtype=wp.vec3, device=device)
 
     shape_of_rows = (worlds, len(shapes), order * order)
-    rows = wp.zeros((*shape_of_rows, kit.points), dtype=wp.float32, device=device)
+    rows = wp.zeros((*shape_of_rows, kit.points // 2), dtype=wp.float32, device=device)
     table = kit.Occlusion()
     table.occluders = occluders
     table.fields = upload_fields(distinct, order, device)
-    table.rows = wp.array(ptr=rows.ptr, dtype=kit.values, shape=shape_of_rows, device=device, copy=False)
+    table.rows = wp.array(ptr=rows.ptr, dtype=kit.half_values, shape=shape_of_rows, device=device, copy=False)
     table.quadrature = quadrature_rows(order, device)
-    directions = sphere.quadrature(kit.points)[0]
+    directions = sphere.quadrature(kit.points)[0][: kit.points // 2]
     return OcclusionState(order, table, wp.array(directions, dtype=wp.vec3, device=device), rows)
 
 

@@ -1,0 +1,133 @@
+"""Functions of direction as their values at the directions of a quadrature, and the inner loops over those.
+
+Every function that shading multiplies (light, transfer, the occluders' visibility) is band-limited, so its values at a
+quadrature's directions hold all of it, and a product of functions is a product of numbers. The product of light,
+transfer and one occluder is then the SH triple product to rounding; with more occluders nothing is truncated between
+one and the next, and their order does not matter.
+
+The second half of the directions are the antipodes of the first. A function is therefore evaluated as its even and its
+odd part at the first half, which is half the work.
+
+The loops are C++: written over whole vectors in Python, each operation would be a pass over memory of its own.
+"""
+
+import math
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis import sh, sphere
+
+
+@cache
+def make_directions(order: int) -> SimpleNamespace:
+    """Vector types and device functions for `order` bands.
+
+    values: the values at all directions; half_values: at the first half; vec: SH coefficients; profile: zonal ones.
+    Directions come as `quadrature`, three rows of half_values, x, y and z.
+    """
+    points = sphere.QUADRATURE_POINTS[order]
+    values = wp.types.vector(points, wp.float32)
+    half_values = wp.types.vector(points // 2, wp.float32)
+    vec = sh.make_sh(order).vec
+    # A zonal function may have a band more than the fields, whose vectors are stored.
+    profile = wp.types.vector(order + 1, wp.float32)
+
+    @wp.func_native(_sum_of_products_snippet(points))
+    def sum_of_products(a: values, b: values) -> float:
+        """The dot product."""
+        ...
+
+    @wp.func_native(_at_directions_snippet(order, points))
+    def at_directions(v: vec, rows: wp.array(dtype=half_values)) -> values:
+        """An SH vector -> its values, with the rows y_k at the first half of the directions."""
+        ...
+
+    @wp.func_native(_zonal_snippet(order, points))
+    def zonal_at_directions(
+        coefficients: profile, axis: wp.vec3, quadrature: wp.array(dtype=half_values)
+    ) -> values:
+        """The values of sum_l c_l P_l(cosine to a unit axis)."""
+        ...
+
+    return SimpleNamespace(
+        order=order,
+        points=points,
+        vec=vec,
+        values=values,
+        half_values=half_values,
+        profile=profile,
+        sum_of_products=sum_of_products,
+        at_directions=at_directions,
+        zonal_at_directions=zonal_at_directions,
+    )
+
+
+def quadrature_rows(order: int, device: wp.Device) -> wp.array:
+    """The first half of the directions, as the rows x, y and z."""
+    points = sphere.QUADRATURE_POINTS[order]
+    directions = sphere.quadrature(points)[0][: points // 2]
+    return wp.array(directions.T.astype(np.float32), dtype=make_directions(order).half_values, device=device)
+
+
+def quadrature_weights(order: int) -> np.ndarray:
+    """The weights of all directions, float64 [points]."""
+    return sphere.quadrature(sphere.QUADRATURE_POINTS[order])[1]
+
+
+def basis_at_directions(order: int) -> np.ndarray:
+    """y_k at all directions, float64 [points, order^2]."""
+    return sh.evaluate(sphere.quadrature(sphere.QUADRATURE_POINTS[order])[0], order)
+
+
+def _sum_of_products_snippet(points: int) -> str:
+    # Sixteen sums side by side, which a CPU adds at once; a single one would be a chain of additions.
+    return f"""
+    float sums[16];
+    for (int lane = 0; lane < 16; ++lane) sums[lane] = 0.0f;
+    for (int i = 0; i < {points}; i += 16)
+        for (int lane = 0; lane < 16; ++lane) sums[lane] += a[i + lane] * b[i + lane];
+    for (int width = 8; width > 0; width /= 2)
+        for (int lane = 0; lane < width; ++lane) sums[lane] += sums[width + lane];
+    return sums[0];
+    """
+
+
+def _at_directions_snippet(order: int, points: int) -> str:
+    half = points // 2
+    terms = {0: [], 1: []}
+    for k in range(order * order):
+        terms[math.isqrt(k) % 2].append(f"v[{k}] * rows.data[{k}][i]")
+    return f"""
+    wp::vec_t<{points}, float> all;
+    for (int i = 0; i < {half}; ++i) {{
+        const float even = {" + ".join(terms[0])};
+        const float odd = {" + ".join(terms[1]) or "0.0f"};
+        all[i] = even + odd;
+        all[{half} + i] = even - odd;
+    }}
+    return all;
+    """
+
+
+def _zonal_snippet(order: int, points: int) -> str:
+    half = points // 2
+    lines = ["float even = coefficients[0], odd = coefficients[1] * t, before = 1.0f, now = t;"]
+    for band in range(2, order + 1):
+        up, down = (2 * band - 1) / band, (band - 1) / band
+        lines.append(f"const float p{band} = {up:.9e}f * t * now - {down:.9e}f * before;")
+        lines.append(f"before = now; now = p{band};")
+        lines.append(f"{'odd' if band % 2 else 'even'} += coefficients[{band}] * now;")
+    return f"""
+    wp::vec_t<{points}, float> all;
+    for (int i = 0; i < {half}; ++i) {{
+        const float t =
+            axis[0] * quadrature.data[0][i] + axis[1] * quadrature.data[1][i] + axis[2] * quadrature.data[2][i];
+        {" ".join(lines)}
+        all[i] = even + odd;
+        all[{half} + i] = even - odd;
+    }}
+    return all;
+    """
