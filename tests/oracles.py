@@ -149,7 +149,7 @@ def polygon_form_factor(points: np.ndarray, normals: np.ndarray, corners: np.nda
     """The share [N] of the irradiance of a white sky that comes from a polygon [K, 3] wholly above the horizon.
 
     Lambert's formula: 1/(2 pi) of the sum, over its edges, of the angle they subtend times the cosine between the
-    normal and that of the plane through the edge and the point. The polygon is counter-clockwise seen from the point.
+    normal and that of the plane through the edge and the point. The polygon is clockwise seen from the point.
     """
     toward = corners[None] - points[:, None]
     toward = toward / np.linalg.norm(toward, axis=2, keepdims=True)

@@ -262,7 +262,7 @@ class Renderer:
         self._delta_lights = make_delta_lights(scene, 1, reach, device)
 
         antialias = self._model.vis.quality.offsamples > 1
-        self._surfaces = make_surfaces(1, self._width, self._height, antialias, device)
+        self._surfaces = make_surfaces(1, self._width, self._height, len(scene.entities), antialias, device)
         self._film = make_film(1, self._width, self._height, background, device)
         self._received = self._make_received(self._surfaces.slots)
         self._lattice = make_lattice(1, self._surfaces.slots, self._width, self._height, device)

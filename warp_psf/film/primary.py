@@ -16,9 +16,11 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.scene.camera import Camera
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, may_hit
 from warp_psf.scene.receiver import ReceiverTable, make_receivers
 
+# Pixels along the side of a tile; rays only meet the entities whose bounding spheres reach into their tile's cone.
+TILE = 16
 SAMPLES = 8
 EXTRA_GROUPS = 3
 # Neighbouring pixels lie on one smooth surface when their normals differ by less than acos(0.9), about 26 degrees,
@@ -36,6 +38,16 @@ class CameraTable:
     tangent: wp.array(dtype=wp.float32)  # (world): tan(fovy / 2)
     width: wp.int32
     height: wp.int32
+
+
+@wp.struct
+class TileTable:
+    """Which entities each tile of the film can see, the nearest first."""
+
+    count: wp.array2d(dtype=wp.int32)  # (world, tile)
+    entity: wp.array3d(dtype=wp.int32)  # (world, tile, place)
+    distance: wp.array3d(dtype=wp.float32)  # (world, tile, place): to the bounding sphere, metres
+    columns: wp.int32
 
 
 @wp.struct
@@ -59,6 +71,7 @@ class Surfaces:
     edge_rank: wp.array  # (world, pixel) int32, running count of edge pixels
     edge_capacity: int  # 0: no antialiasing
     camera: CameraTable
+    tiles: TileTable
 
     @property
     def slots(self) -> int:
@@ -82,14 +95,67 @@ def camera_ray(camera: CameraTable, world: int, x: float, y: float) -> wp.vec3:
     return camera.rotation[world] * wp.vec3(right, up, -1.0)
 
 
+@wp.kernel(module="unique")
+def _fill_tiles(
+    first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, tiles: TileTable
+):
+    world, tile = wp.tid()
+    tile += first
+    size = float(wp.static(TILE))
+    x = float(tile % tiles.columns) * size
+    y = float(tile / tiles.columns) * size
+    axis = wp.normalize(camera_ray(camera, world, x + 0.5 * size, y + 0.5 * size))
+    widest = float(1.0)
+    for corner in range(4):
+        ray = camera_ray(camera, world, x + size * float(corner % 2), y + size * float(corner / 2))
+        widest = wp.min(widest, wp.dot(axis, wp.normalize(ray)))
+    # A hundredth wider, for acos near 1 has few digits.
+    half_angle = 1.01 * wp.acos(widest) + 1.0e-4
+    count = int(0)
+    for entity in range(geometry.entity_mesh.shape[0]):
+        center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
+        offset = center - camera.position[world]
+        distance = wp.length(offset)
+        radius = geometry.radius[entity]
+        seen = distance <= radius
+        if not seen:
+            apart = wp.acos(wp.clamp(wp.dot(offset, axis) / distance, -1.0, 1.0))
+            seen = apart < half_angle + wp.asin(radius / distance)
+        if seen:
+            gap = distance - radius
+            place = count
+            while place > 0 and tiles.distance[world, tile, wp.max(place - 1, 0)] > gap:
+                tiles.entity[world, tile, place] = tiles.entity[world, tile, place - 1]
+                tiles.distance[world, tile, place] = tiles.distance[world, tile, place - 1]
+                place -= 1
+            tiles.entity[world, tile, place] = entity
+            tiles.distance[world, tile, place] = gap
+            count += 1
+    tiles.count[world, tile] = count
+
+
 @wp.func
-def trace(geometry: GeometryTable, poses: PoseTable, world: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
-    """The nearest surface along a ray; `distance` is in units of `direction`, entity -1 is nothing."""
+def tile_of(tiles: TileTable, pixel: int, width: int) -> int:
+    return (pixel / width / wp.static(TILE)) * tiles.columns + (pixel % width) / wp.static(TILE)
+
+
+@wp.func
+def trace(
+    geometry: GeometryTable,
+    poses: PoseTable,
+    tiles: TileTable,
+    tile: int,
+    world: int,
+    origin: wp.vec3,
+    direction: wp.vec3,
+) -> Hit:
+    """The nearest surface along a camera ray; `distance` is in units of `direction`, entity -1 is nothing."""
     hit = Hit()
     hit.entity = -1
     nearest = float(1.0e30)
     length_squared = wp.dot(direction, direction)
-    for entity in range(geometry.entity_mesh.shape[0]):
+    for place in range(tiles.count[world, tile]):
+        entity = tiles.entity[world, tile, place]
         position = poses.position[world, entity]
         rotation = poses.rotation[world, entity]
         to_center = position + rotation * geometry.center[entity] - origin
@@ -101,19 +167,19 @@ def trace(geometry: GeometryTable, poses: PoseTable, world: int, origin: wp.vec3
             root = wp.sqrt(reach)
             if along + root > 0.0 and along - root < nearest * length_squared:
                 inverse = wp.transpose(rotation)
-                query = wp.mesh_query_ray(
-                    geometry.mesh_id[geometry.entity_mesh[entity]],
-                    inverse * (origin - position),
-                    inverse * direction,
-                    nearest,
-                )
-                if query.result:
-                    nearest = query.t
-                    hit.entity = entity
-                    hit.face = query.face
-                    hit.u = query.u
-                    hit.v = query.v
-                    hit.normal = query.normal
+                origin_entity = inverse * (origin - position)
+                direction_entity = inverse * direction
+                if may_hit(geometry, entity, origin_entity, direction_entity, nearest):
+                    query = wp.mesh_query_ray(
+                        geometry.mesh_id[geometry.entity_mesh[entity]], origin_entity, direction_entity, nearest
+                    )
+                    if query.result:
+                        nearest = query.t
+                        hit.entity = entity
+                        hit.face = query.face
+                        hit.u = query.u
+                        hit.v = query.v
+                        hit.normal = query.normal
     if hit.entity >= 0:
         hit.distance = nearest
         hit.position = origin + nearest * direction
@@ -147,13 +213,20 @@ def store_hit(receivers: ReceiverTable, world: int, slot: int, hit: Hit, weight:
 
 @wp.kernel(module="unique")
 def _trace_centers(
-    first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, receivers: ReceiverTable
+    first: int,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    camera: CameraTable,
+    tiles: TileTable,
+    receivers: ReceiverTable,
 ):
     world, pixel = wp.tid()
     pixel += first
     x = float(pixel % camera.width) + 0.5
     y = float(pixel / camera.width) + 0.5
-    hit = trace(geometry, poses, world, camera.position[world], camera_ray(camera, world, x, y))
+    tile = tile_of(tiles, pixel, camera.width)
+    ray = camera_ray(camera, world, x, y)
+    hit = trace(geometry, poses, tiles, tile, world, camera.position[world], ray)
     store_hit(receivers, world, pixel, hit, wp.where(hit.entity >= 0, 1.0, 0.0))
 
 
@@ -195,6 +268,7 @@ def _trace_edges(
     geometry: GeometryTable,
     poses: PoseTable,
     camera: CameraTable,
+    tiles: TileTable,
     edge: wp.array2d(dtype=wp.int32),
     edge_rank: wp.array2d(dtype=wp.int32),
     edge_capacity: int,
@@ -208,6 +282,7 @@ def _trace_edges(
     if edge[world, pixel] == 1 and rank < edge_capacity:
         slot = camera.width * camera.height + wp.static(EXTRA_GROUPS) * rank
         extra_out[world, pixel] = slot
+        tile = tile_of(tiles, pixel, camera.width)
         share = 1.0 / float(wp.static(SAMPLES))
         entities = wp.vec4i(receivers.entity[world, pixel], -1, -1, -1)
         normals = wp.matrix(shape=(4, 3), dtype=float)
@@ -221,7 +296,7 @@ def _trace_edges(
         for sample in range(samples):
             offset = sample_offset(sample)
             ray = camera_ray(camera, world, x + offset[0], y + offset[1])
-            hit = trace(geometry, poses, world, camera.position[world], ray)
+            hit = trace(geometry, poses, tiles, tile, world, camera.position[world], ray)
             if hit.entity >= 0:
                 found = int(-1)
                 for group in range(groups):
@@ -249,7 +324,9 @@ def _trace_edges(
             receivers.entity[world, slot + group - 1] = -1
 
 
-def make_surfaces(worlds: int, width: int, height: int, antialias: bool, device: wp.Device) -> Surfaces:
+def make_surfaces(
+    worlds: int, width: int, height: int, entities: int, antialias: bool, device: wp.Device
+) -> Surfaces:
     """Room for the surfaces of a film of width x height pixels; without `antialias` a pixel is its centre."""
     pixels = width * height
     capacity = math.ceil(EDGE_SHARE * pixels) if antialias else 0
@@ -262,7 +339,13 @@ def make_surfaces(worlds: int, width: int, height: int, antialias: bool, device:
     camera.tangent = wp.zeros(worlds, dtype=wp.float32, device=device)
     camera.width, camera.height = width, height
     extra, edge, rank = (wp.zeros((worlds, pixels), dtype=wp.int32, device=device) for _ in range(3))
-    return Surfaces(receivers, extra, edge, rank, capacity, camera)
+    tiles = TileTable()
+    tiles.columns = math.ceil(width / TILE)
+    shape = (worlds, tiles.columns * math.ceil(height / TILE))
+    tiles.count = wp.zeros(shape, dtype=wp.int32, device=device)
+    tiles.entity = wp.zeros((*shape, entities), dtype=wp.int32, device=device)
+    tiles.distance = wp.zeros((*shape, entities), dtype=wp.float32, device=device)
+    return Surfaces(receivers, extra, edge, rank, capacity, camera, tiles)
 
 
 def aim(surfaces: Surfaces, cameras: list[Camera]) -> None:
@@ -277,7 +360,9 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     """Fills `surfaces` with what the camera sees of the scene in its present poses."""
     camera, receivers = surfaces.camera, surfaces.receivers
     dim = surfaces.edge.shape
-    launch(_trace_centers, dim, [scene.geometry, scene.poses, camera, receivers], [], device)
+    tiles = surfaces.tiles
+    launch(_fill_tiles, tiles.count.shape, [scene.geometry, scene.poses, camera, tiles], [], device)
+    launch(_trace_centers, dim, [scene.geometry, scene.poses, camera, tiles, receivers], [], device)
     if surfaces.edge_capacity == 0:
         surfaces.extra.fill_(-1)
         return
@@ -285,5 +370,5 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     wp.utils.array_scan(surfaces.edge.flatten(), surfaces.edge_rank.flatten(), inclusive=False)
     # What an earlier frame left in slots that this frame's edges do not reach.
     receivers.entity[:, dim[1] :].fill_(-1)
-    inputs = [scene.geometry, scene.poses, camera, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, receivers]
+    inputs = [scene.geometry, scene.poses, camera, tiles, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, receivers]
     launch(_trace_edges, dim, inputs, [surfaces.extra], device)

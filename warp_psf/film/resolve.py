@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.film.primary import EXTRA_GROUPS, SAMPLES, CameraTable, Surfaces, camera_ray
-from warp_psf.scene.geometry import DeviceScene, GeometryTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable
 
 
@@ -55,10 +55,27 @@ def look_up(image: wp.array2d(dtype=wp.vec3), direction: wp.vec3) -> wp.vec3:
     )
 
 
+@wp.func
+def shows_front(receivers: ReceiverTable, world: int, slot: int, geometry: GeometryTable, poses: PoseTable) -> bool:
+    """Whether the viewer is on the outer side of the receiver's face: a receiver's normal is turned to the viewer."""
+    entity = receivers.entity[world, slot]
+    mesh = geometry.entity_mesh[entity]
+    corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, slot]]
+    uv = receivers.uv[world, slot]
+    start = geometry.first_vertex[mesh]
+    outward = (
+        uv[0] * geometry.normals[start + corners[0]]
+        + uv[1] * geometry.normals[start + corners[1]]
+        + (1.0 - uv[0] - uv[1]) * geometry.normals[start + corners[2]]
+    )
+    return wp.dot(poses.rotation[world, entity] * outward, receivers.normal[world, slot]) > 0.0
+
+
 @wp.kernel(module="unique")
 def _resolve_pixels(
     first: int,
     geometry: GeometryTable,
+    poses: PoseTable,
     camera: CameraTable,
     receivers: ReceiverTable,
     extra: wp.array2d(dtype=wp.int32),  # (world, pixel)
@@ -88,7 +105,10 @@ def _resolve_pixels(
                 wp.cw_mul(reflectance, diffuse[world, slot]) * wp.static(1.0 / math.pi)
                 + wp.cw_mul(geometry.specular[entity], glossy[world, slot])
             )
-            shine += weight * geometry.emission[entity]
+            emission = geometry.emission[entity]
+            if wp.max(emission) > 0.0:
+                # Surfaces shine from their fronts.
+                shine += wp.where(shows_front(receivers, world, slot, geometry, poses), weight, 0.0) * emission
             albedo += weight * reflectance
             normal += weight * receivers.normal[world, slot]
             covered += weight
@@ -126,8 +146,8 @@ def resolve_pixels(
     film: Film, surfaces: Surfaces, scene: DeviceScene, diffuse: wp.array, glossy: wp.array, device: wp.Device
 ) -> None:
     """Writes the film's layers from what the surfaces' receivers received, vec3 (world, slot)."""
-    inputs = [scene.geometry, surfaces.camera, surfaces.receivers, surfaces.extra, diffuse, glossy, film.background]
-    launch(_resolve_pixels, surfaces.extra.shape, [*inputs, film.layers], [], device)
+    inputs = [scene.geometry, scene.poses, surfaces.camera, surfaces.receivers, surfaces.extra, diffuse, glossy]
+    launch(_resolve_pixels, surfaces.extra.shape, [*inputs, film.background, film.layers], [], device)
 
 
 def read_layers(film: Film, world: int = 0) -> dict[str, np.ndarray]:

@@ -1,0 +1,117 @@
+"""The lattice of shaded pixels: what it interpolates is what shading every pixel gives."""
+
+import numpy as np
+import pytest
+
+import warp_psf as psf
+from tests.oracles import make_renderer
+from warp_psf.shade import lattice
+from warp_psf.shade.direct import shade_direct
+
+HEIGHT, WIDTH = 54, 95  # not a multiple of the strides
+SCENE = (
+    '<geom name="floor" type="plane" size="20 20 .1" material="white"/>'
+    '<geom type="sphere" size=".5" pos="-.7 0 .5" rgba=".2 .5 .8 1"/><geom type="box" size=".3 .3 .4" pos=".6 .3 .4"/>'
+    '<camera name="front" pos="0 -5 2.5" xyaxes="1 0 0 0 .45 .9"/>'
+)
+
+
+def sky() -> psf.Environment:
+    light = 0.2 * np.random.default_rng(5).normal(size=(16, 3))
+    light[0] += 3.0
+    light[2] += 1.0
+    return psf.Environment.from_coefficients(light)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    panel = psf.rectangle_light("panel", 2, 1, (2, 1.5, 1), (1, -2, 3), (0, 0, 0))
+    renderer, data = make_renderer(SCENE, HEIGHT, WIDTH, environment=sky(), lights=[panel])
+    renderer.update_scene(data, "front")
+    renderer.layers()
+    return renderer
+
+
+def shade_everything(renderer) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance and Phong radiance [slots, 3] of the last picture, with every receiver shaded."""
+    turns = renderer._lattice.turns
+    before = turns.numpy()
+    turns.fill_(1)
+    received = renderer._make_received(renderer._surfaces.slots)
+    lights = (renderer._occlusion, renderer._lighting)
+    shade_direct(
+        renderer._surfaces.receivers, turns, 1, renderer._device_scene, *lights, *received, renderer._device
+    )
+    turns.assign(before)
+    return received[0].numpy()[0], received[1].numpy()[0]
+
+
+def test_interpolated_light_is_nearly_that_of_every_pixel(scene):
+    entity = scene._surfaces.receivers.entity.numpy()[0]
+    turns = scene._lattice.turns.numpy()[0]
+    for found, full in zip(scene._received, shade_everything(scene), strict=True):
+        seen = entity >= 0
+        error = np.abs(found.numpy()[0] - full)[seen] / full[seen].max()
+        interpolated = turns[seen] == lattice.INTERPOLATED
+        # Shaded ones are shaded alike; a cell whose corners differ by 4 % bends by an eighth of that between them.
+        assert not error[~interpolated].any()
+        assert error.max() < 0.005
+    assert 0.2 < (turns[: HEIGHT * WIDTH] == lattice.INTERPOLATED).mean() < 0.9
+
+
+def test_every_receiver_gets_its_turn(scene):
+    entity = scene._surfaces.receivers.entity.numpy()[0]
+    turns = scene._lattice.turns.numpy()[0]
+    assert np.isin(turns, (1, 2, 3, lattice.INTERPOLATED)).all()
+    assert (turns[entity < 0] == lattice.INTERPOLATED).all()
+    # Edge pixels and their groups are shaded.
+    extra = scene._surfaces.extra.numpy()[0]
+    edges = np.flatnonzero((extra >= 0) & (entity[: len(extra)] >= 0))
+    assert len(edges) > 50
+    assert (turns[edges] == 1).all()
+    groups = np.flatnonzero(entity[len(extra) :] >= 0) + len(extra)
+    assert (turns[groups] == 1).all()
+
+
+def test_a_threshold_of_nothing_shades_everything(scene, monkeypatch):
+    # Cells that show no surface, or are of exactly one colour, still need no shading: here none is.
+    pixels = scene._surfaces.receivers
+    lattice.begin_lattice(scene._lattice, pixels, scene._surfaces.extra, scene._device)
+    noise = np.random.default_rng(1).uniform(1, 2, (1, scene._surfaces.slots, 3)).astype(np.float32)
+    received = scene._make_received(scene._surfaces.slots)
+    for array in received:
+        array.assign(noise)
+    for turn in (1, 2):
+        lattice.refine_lattice(scene._lattice, turn, pixels, *received, scene._device)
+    turns = scene._lattice.turns.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
+    entity = pixels.entity.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
+    assert (turns[entity >= 0] != lattice.INTERPOLATED).all()
+    np.testing.assert_array_equal(received[0].numpy()[0], noise[0])
+
+
+def test_linear_light_is_interpolated_exactly(scene):
+    pixels, device = scene._surfaces.receivers, scene._device
+    lattice.begin_lattice(scene._lattice, pixels, scene._surfaces.extra, device)
+    y, x = np.divmod(np.arange(scene._surfaces.slots), WIDTH)
+    ramp = (10 + 0.02 * x + 0.01 * y)[:, None] * np.ones(3)
+    first = scene._lattice.turns.numpy()[0] == 1
+    received = scene._make_received(scene._surfaces.slots)
+    for array in received:
+        array.assign((ramp * first[:, None]).astype(np.float32)[None])
+    lattice.refine_lattice(scene._lattice, 1, pixels, *received, device)
+    done = scene._lattice.turns.numpy()[0] == lattice.INTERPOLATED
+    done &= pixels.entity.numpy()[0] >= 0
+    assert done.sum() > 1000
+    for array in received:
+        np.testing.assert_allclose(array.numpy()[0][done], ramp[done], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 7), (5, 1), (3, 4), (5, 6)])
+def test_pictures_smaller_than_a_cell(height, width):
+    renderer, data = make_renderer(SCENE, height, width, environment=sky())
+    renderer.update_scene(data, "front")
+    layers = renderer.layers()
+    entity = renderer._surfaces.receivers.entity.numpy()[0] >= 0
+    np.testing.assert_allclose(renderer._received[0].numpy()[0][entity], shade_everything(renderer)[0][entity], rtol=5e-3)
+    assert layers["color"].shape == (height, width, 3)
+    assert (layers["color"] > 0).all()
