@@ -1,8 +1,8 @@
 """Simulations to render: bowling, falling, statues; `python -m sims.bowling` simulates and renders one.
 
 Each of the three modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
-`lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the geoms that do are in
-group 3, which is not drawn.
+`lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the
+geoms that do are in group 3, which is not drawn.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ HIDDEN_GROUP = 3
 # Seconds: two steps are the shortest time constant that MuJoCo's contacts keep stable.
 TIMESTEP = 0.001
 # A satin highlight, as broad as four bands of spherical harmonics can show.
-SHININESS = 0.25
+SHININESS = 0.08
 
 
 def new_stage(position: tuple[float, float, float], target: tuple[float, float, float], fovy: float) -> mujoco.MjSpec:
@@ -79,15 +79,15 @@ def draw_box(body: mujoco.MjsBody, name: str, low: tuple, high: tuple, material:
     )
 
 
-def dimmed_studio(share: float, turn: float = 0.0) -> psf.Environment:
-    """The built-in studio at a share of its light, turned about z by `turn` radians: what fills the shadows of a key.
+def dimmed(name: str, share: float, turn: float = 0.0) -> psf.Environment:
+    """A built-in environment at a share of its light, turned about z by `turn` radians.
 
-    The studio alone lights a white floor to radiance 1; with an area light besides, that would be too bright.
+    Each alone lights a white floor to radiance 1; beside an area light, whose shadows it fills, that is too bright.
     """
     import warp_psf as psf
 
-    studio = psf.load_environment("studio").rotated(turn)
-    return psf.Environment("dimmed studio", share * studio.radiance)
+    full = psf.load_environment(name).rotated(turn)
+    return psf.Environment(f"dimmed {name}", share * full.radiance)
 
 
 def step_frames(

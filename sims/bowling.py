@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from sims import HIDDEN_GROUP, add_material, add_mesh, dimmed_studio, draw_box, draw_mesh, new_stage, step_frames
+from sims import HIDDEN_GROUP, add_material, add_mesh, dimmed, draw_box, draw_mesh, new_stage, step_frames
 from sims.bodies import BALL_DIAMETER, INCH, ball, pin, pin_profile
 from sims.surfaces import revolve
 
@@ -36,12 +36,12 @@ BALL_SIDE_SPIN = 3.0
 
 def build() -> mujoco.MjModel:
     """Lane, side walls, curtain, rack and ball."""
-    spec = new_stage(position=(-4.0, -1.9, 1.25), target=(0.2, 0.0, 0.14), fovy=15)
-    add_material(spec, "lane", (0.83, 0.68, 0.5), gloss=0.1)
-    add_material(spec, "wall", (0.3, 0.42, 0.46))
-    add_material(spec, "curtain", (0.36, 0.5, 0.54))
-    add_material(spec, "pin", (0.92, 0.91, 0.88), gloss=0.25)
-    add_material(spec, "ball", (0.06, 0.12, 0.34), gloss=1.0)
+    spec = new_stage(position=(-4.3, -1.5, 1.05), target=(0.2, -0.1, 0.17), fovy=12.8)
+    add_material(spec, "lane", (0.86, 0.71, 0.53), gloss=0.04)
+    add_material(spec, "wall", (0.88, 0.84, 0.78))
+    add_material(spec, "curtain", (0.52, 0.64, 0.68))
+    add_material(spec, "pin", (0.93, 0.92, 0.89), gloss=0.12)
+    add_material(spec, "ball", (0.07, 0.16, 0.5), gloss=0.6)
     _add_lane(spec)
     add_mesh(spec, "pin", pin(rings=64, segments=54))
     for low, high in PIN_SLICES:
@@ -73,14 +73,14 @@ def lights() -> tuple:
 
     return (
         psf.rectangle_light(
-            "soft box", 0.8, 0.8, radiance=(17.0, 15.8, 14.0), position=(-0.6, 1.9, 1.6), target=(0.3, 0.0, 0.0)
+            "soft box", 1.5, 1.5, radiance=(36.0, 34.0, 31.0), position=(-3.0, 2.7, 2.9), target=(0.3, 0.0, 0.1)
         ),
     )
 
 
 def environment() -> psf.Environment:
     """A third as bright as the soft box."""
-    return dimmed_studio(0.35, turn=-math.pi / 2)
+    return dimmed("studio", 0.33, turn=-math.pi / 2)
 
 
 def _add_lane(spec: mujoco.MjSpec) -> None:
@@ -89,8 +89,8 @@ def _add_lane(spec: mujoco.MjSpec) -> None:
     world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], group=HIDDEN_GROUP, friction=[0.25, 0.003, 0.0003])
     # Walls reach into the lane: two surfaces in one plane would fight over the same pixels.
     walls = {
-        "wall_left": ((-0.1, 0.85, -0.03), (1.4, 0.92, 0.34), "wall", LIVELY),
-        "wall_right": ((-0.1, -0.92, -0.03), (1.4, -0.85, 0.34), "wall", LIVELY),
+        "wall_left": ((-0.1, 0.95, -0.03), (1.4, 1.02, 0.2), "wall", LIVELY),
+        "wall_right": ((-0.1, -1.02, -0.03), (1.4, -0.95, 0.2), "wall", LIVELY),
         "curtain": ((1.45, -3.4, -0.03), (1.55, 3.4, 1.25), "curtain", DULL),
     }
     for name, (low, high, material, solref) in walls.items():

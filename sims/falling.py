@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from sims import HIDDEN_GROUP, add_material, add_mesh, draw_box, draw_mesh, new_stage, step_frames
+from sims import HIDDEN_GROUP, add_material, add_mesh, dimmed, draw_box, draw_mesh, new_stage, step_frames
 from sims.bodies import (
     ball,
     chain_link,
@@ -30,6 +31,9 @@ from sims.bodies import (
     vase,
 )
 
+if TYPE_CHECKING:
+    import warp_psf as psf
+
 BOX, SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 CAPSULE, CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
 ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
@@ -42,10 +46,10 @@ SOLREF = (0.005, 1.2)
 # sRGB colours and the gloss of each.
 PALETTE = {
     "terracotta": ((0.78, 0.42, 0.31), 0.0),
-    "ochre": ((0.85, 0.66, 0.35), 0.3),
-    "teal": ((0.2, 0.49, 0.5), 0.5),
+    "ochre": ((0.85, 0.66, 0.35), 0.1),
+    "teal": ((0.2, 0.49, 0.5), 0.15),
     "cream": ((0.9, 0.86, 0.77), 0.0),
-    "ink": ((0.17, 0.23, 0.35), 0.7),
+    "ink": ((0.17, 0.23, 0.35), 0.2),
     "sage": ((0.57, 0.66, 0.54), 0.0),
 }
 # What falls, from the lowest to the highest: shape and colour.
@@ -80,8 +84,8 @@ HULL_VERTICES = 250
 
 def build() -> mujoco.MjModel:
     """Floor and bodies, each body turned at random before it falls."""
-    spec = new_stage(position=(0.22, -2.0, 1.45), target=(0.0, -0.05, 0.12), fovy=36)
-    add_material(spec, "floor", (0.74, 0.72, 0.69))
+    spec = new_stage(position=(0.2, -2.0, 1.45), target=(-0.03, -0.16, 0.1), fovy=28)
+    add_material(spec, "floor", (0.84, 0.81, 0.77))
     for name, (rgb, gloss) in PALETTE.items():
         add_material(spec, name, rgb, gloss)
     draw_box(spec.worldbody, "floor", (-4.2, -3.4, -0.1), (4.2, 5.0, 0.0), "floor")
@@ -111,9 +115,14 @@ def lights() -> tuple:
 
     return (
         psf.rectangle_light(
-            "window", 1.2, 1.2, radiance=(8.0, 7.6, 7.0), position=(-1.9, -0.9, 2.3), target=(0.0, 0.0, 0.2)
+            "window", 1.2, 1.2, radiance=(26.0, 24.8, 23.0), position=(-2.6, -0.8, 2.3), target=(0.0, 0.0, 0.1)
         ),
     )
+
+
+def environment() -> psf.Environment:
+    """A third as bright as the window."""
+    return dimmed("studio", 0.33)
 
 
 def _shapes(spec: mujoco.MjSpec) -> dict[str, list[dict]]:
@@ -249,4 +258,4 @@ def _mug_staves(radius: float, height: float) -> list[dict]:
 if __name__ == "__main__":
     from warp_psf.cli import run_simulation
 
-    run_simulation(build, states, name="falling", camera="front", environment="studio", lights=lights())
+    run_simulation(build, states, name="falling", camera="front", environment=environment(), lights=lights())

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import mujoco
 
-from sims import add_material, add_mesh, draw_box, draw_mesh, frame_numbers, new_stage
+from sims import add_material, add_mesh, dimmed, draw_box, draw_mesh, frame_numbers, new_stage
 from sims.bodies import pedestal, statue_like
+
+if TYPE_CHECKING:
+    import warp_psf as psf
 
 # Metres.
 PEDESTAL_HEIGHT, STATUE_HEIGHT = 0.42, 1.25
@@ -28,14 +32,14 @@ STATUES = {
 
 def build() -> mujoco.MjModel:
     """Floor, pedestal and four statues; the statues are mocap bodies."""
-    spec = new_stage(position=(0.25, -5.0, 1.75), target=(0.0, 0.0, 0.78), fovy=32)
-    add_material(spec, "floor", (0.71, 0.69, 0.66))
+    spec = new_stage(position=(0.25, -5.0, 1.45), target=(0.0, 0.0, 0.84), fovy=28)
+    add_material(spec, "floor", (0.82, 0.79, 0.75))
     add_material(spec, "stone", (0.62, 0.6, 0.57))
-    add_material(spec, "bronze", (0.66, 0.45, 0.28), gloss=0.6)
+    add_material(spec, "bronze", (0.66, 0.45, 0.28), gloss=0.2)
     add_material(spec, "marble", (0.9, 0.88, 0.84))
     add_material(spec, "clay", (0.75, 0.44, 0.34))
-    add_material(spec, "slate", (0.27, 0.36, 0.43), gloss=0.5)
-    draw_box(spec.worldbody, "floor", (-7.0, -5.0, -0.1), (7.0, 5.0, 0.0), "floor")
+    add_material(spec, "slate", (0.27, 0.36, 0.43), gloss=0.15)
+    draw_box(spec.worldbody, "floor", (-30.0, -6.0, -0.1), (30.0, 54.0, 0.0), "floor")
     add_mesh(spec, "pedestal", pedestal(0.4, PEDESTAL_HEIGHT, rings=28, segments=60))
     add_mesh(spec, "raised", statue_like("raised", STATUE_HEIGHT, cells=RAISED_CELLS))
     add_mesh(spec, "staff", statue_like("staff", STATUE_HEIGHT, cells=STAFF_CELLS))
@@ -62,9 +66,14 @@ def lights() -> tuple:
 
     return (
         psf.rectangle_light(
-            "window", 1.4, 2.0, radiance=(9.0, 8.5, 7.8), position=(-3.2, -1.8, 2.6), target=(0.0, 0.0, 0.7)
+            "window", 2.2, 2.2, radiance=(30.0, 26.5, 21.5), position=(-4.6, -3.6, 4.4), target=(0.0, 0.0, 0.5)
         ),
     )
+
+
+def environment() -> psf.Environment:
+    """A day's sky."""
+    return dimmed("sky", 0.55)
 
 
 def _place_statues(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -83,4 +92,4 @@ def _place_statues(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 if __name__ == "__main__":
     from warp_psf.cli import run_simulation
 
-    run_simulation(build, states, name="statues", camera="front", environment="studio", lights=lights())
+    run_simulation(build, states, name="statues", camera="front", environment=environment(), lights=lights())

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_psf as psf
 from tests.oracles import make_renderer
 from warp_psf.shade import lattice
 from warp_psf.shade.direct import shade_direct
 
-HEIGHT, WIDTH = 54, 95  # not a multiple of the strides
+HEIGHT, WIDTH = 215, 381  # not multiples of the strides
 SCENE = (
     '<geom name="floor" type="plane" size="20 20 .1" material="white"/>'
     '<geom type="sphere" size=".5" pos="-.7 0 .5" rgba=".2 .5 .8 1"/><geom type="box" size=".3 .3 .4" pos=".6 .3 .4"/>'
@@ -25,8 +26,7 @@ def sky() -> psf.Environment:
 
 @pytest.fixture(scope="module")
 def scene():
-    panel = psf.rectangle_light("panel", 2, 1, (2, 1.5, 1), (1, -2, 3), (0, 0, 0))
-    renderer, data = make_renderer(SCENE, HEIGHT, WIDTH, environment=sky(), lights=[panel])
+    renderer, data = make_renderer(SCENE, HEIGHT, WIDTH, environment=sky())
     renderer.update_scene(data, "front")
     renderer.layers()
     return renderer
@@ -34,28 +34,25 @@ def scene():
 
 def shade_everything(renderer) -> tuple[np.ndarray, np.ndarray]:
     """Irradiance and Phong radiance [slots, 3] of the last picture, with every receiver shaded."""
-    turns = renderer._lattice.turns
-    before = turns.numpy()
-    turns.fill_(1)
+    turns = wp.full((1, renderer._surfaces.slots), 1, dtype=wp.int32, device=renderer._device)
     received = renderer._make_received(renderer._surfaces.slots)
     lights = (renderer._occlusion, renderer._lighting)
     shade_direct(
         renderer._surfaces.receivers, turns, 1, renderer._device_scene, *lights, *received, renderer._device
     )
-    turns.assign(before)
     return received[0].numpy()[0], received[1].numpy()[0]
 
 
 def test_interpolated_light_is_nearly_that_of_every_pixel(scene):
     entity = scene._surfaces.receivers.entity.numpy()[0]
     turns = scene._lattice.turns.numpy()[0]
-    for found, full in zip(scene._received, shade_everything(scene), strict=True):
+    # Cells that are interpolated bend by 0.5 % between their corners as far as the lattice can tell.
+    for found, full, limit in zip(scene._received, shade_everything(scene), (0.006, 0.006), strict=True):
         seen = entity >= 0
         error = np.abs(found.numpy()[0] - full)[seen] / full[seen].max()
         interpolated = turns[seen] == lattice.INTERPOLATED
-        # Shaded ones are shaded alike; a cell whose corners differ by 4 % bends by an eighth of that between them.
         assert not error[~interpolated].any()
-        assert error.max() < 0.005
+        assert error.max() < limit
     assert 0.2 < (turns[: HEIGHT * WIDTH] == lattice.INTERPOLATED).mean() < 0.9
 
 
@@ -73,8 +70,7 @@ def test_every_receiver_gets_its_turn(scene):
     assert (turns[groups] == 1).all()
 
 
-def test_a_threshold_of_nothing_shades_everything(scene, monkeypatch):
-    # Cells that show no surface, or are of exactly one colour, still need no shading: here none is.
+def test_noise_is_never_interpolated(scene):
     pixels = scene._surfaces.receivers
     lattice.begin_lattice(scene._lattice, pixels, scene._surfaces.extra, scene._device)
     noise = np.random.default_rng(1).uniform(1, 2, (1, scene._surfaces.slots, 3)).astype(np.float32)

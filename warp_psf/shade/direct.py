@@ -118,7 +118,8 @@ def make_direct(order: int) -> SimpleNamespace:
             position = poses.position[world, shining]
             center = position + rotation * geometry.center[shining]
             facing = rotation * lighting.light_facing[light]
-            lit = wp.dot(n, center - p) > -geometry.radius[shining] and shining != entity
+            risen = kit.rise_over_horizon(wp.dot(n, center - p), geometry.radius[shining])
+            lit = risen > 0.0 and shining != entity
             if wp.length_sq(facing) > 0.0:
                 lit = lit and wp.dot(facing, p - center) > 0.0
             if lit:
@@ -136,7 +137,7 @@ def make_direct(order: int) -> SimpleNamespace:
                 )
                 visible = kit.visibility_before(world, entity, shining, p, n, geometry, poses, o)
                 weighted = wp.cw_mul(wp.cw_mul(seen, visible), lighting.weights[0])
-                radiance = lighting.light_radiance[world, light]
+                radiance = risen * lighting.light_radiance[world, light]
                 # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
                 diffuse += wp.max(kit.sum_of_products(weighted, transfer), 0.0) * radiance
                 if glossy:

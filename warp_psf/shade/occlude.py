@@ -1,5 +1,6 @@
 """Composing occluders: the visibility that the bodies around a receiver leave, at the directions of a quadrature."""
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -17,12 +18,19 @@ from warp_psf.scene.scene import Scene
 from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
 from warp_psf.shade.directions import quadrature_rows
 
-# An occluder whose bounding sphere could take less than this share of a diffuse receiver's light is left out.
-# Seen face-on a sphere of radius R at distance d takes (R/d)^2; a two-hundredth of an 8-bit step per occluder.
+# An occluder whose bounding sphere could take less than this share of a diffuse receiver's light is left out: seen
+# face-on a sphere of radius R at distance d takes (R/d)^2. It fades in up to twice the share, so that nothing pops.
 SMALLEST_SHARE = 1.0e-3
+# A body whose bounding sphere lies below the receiver's horizon is left out too: what band-limited functions let
+# through there is not real. It fades in as it rises by this share of its radius.
+HORIZON_FADE = 0.6
 # A slab whose corners rise above the receiver's tangent plane by less than this share of its half-diagonal counts as
 # below it: the floor beside a receiver on the same floor.
 SLAB_HORIZON = 1.0e-5
+# The search for where a slab comes nearest to the rays to a light begins at this share of the light's distance, and
+# each step cuts the interval by a third: to 1 %.
+SLAB_NEAREST = 1.0e-3
+SLAB_STEPS = 16
 
 
 @cache
@@ -44,22 +52,29 @@ def make_occlude(order: int) -> SimpleNamespace:
         quadrature: wp.array(dtype=half_values)  # x, y, z of the first half of the directions
 
     @wp.func
+    def rise_over_horizon(height: float, radius: float) -> float:
+        """0 for a sphere that lies below the receiver's tangent plane, 1 for one well above it; smooth between."""
+        risen = wp.clamp((height + radius) / (wp.static(HORIZON_FADE) * radius), 0.0, 1.0)
+        return risen * risen * (3.0 - 2.0 * risen)
+
+    @wp.func
     def matters(
         entity: int, own: int, p: wp.vec3, n: wp.vec3, center: wp.vec3, radius: float, rotation: wp.mat33, o: Occlusion
-    ) -> bool:
-        """Whether an entity can take light from a receiver at p with normal n."""
+    ) -> float:
+        """How far an entity can take light from a receiver at p with normal n: 0 not at all, 1 fully."""
         if entity == own or not o.occluders.casts[entity]:
-            return False
+            return 0.0
         offset = center - p
         height = wp.dot(n, offset)
         if height < -radius:
-            return False  # below the horizon
+            return 0.0
         if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
             half = o.occluders.slab_half[entity]
             n_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity]) * n
             rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
-            return height + rise > wp.static(SLAB_HORIZON) * radius
-        return radius * radius > wp.static(SMALLEST_SHARE) * wp.dot(offset, offset)
+            return wp.where(height + rise > wp.static(SLAB_HORIZON) * radius, 1.0, 0.0)
+        share = radius * radius / wp.max(wp.dot(offset, offset), 1.0e-12)
+        return rise_over_horizon(height, radius) * wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
 
     @wp.func
     def visibility_at(
@@ -72,7 +87,8 @@ def make_occlude(order: int) -> SimpleNamespace:
             rotation = poses.rotation[world, entity]
             radius = geometry.radius[entity]
             center = position + rotation * geometry.center[entity]
-            if matters(entity, own, p, n, center, radius, rotation, o):
+            weight = matters(entity, own, p, n, center, radius, rotation, o)
+            if weight > 0.0:
                 covered = kit.coverage_of(
                     entity,
                     p,
@@ -85,8 +101,15 @@ def make_occlude(order: int) -> SimpleNamespace:
                     o.rows[world, entity],
                     o.quadrature,
                 )
-                visible = wp.cw_mul(visible, values(1.0) - covered)
+                visible = wp.cw_mul(visible, values(1.0) - weight * covered)
         return visible
+
+    @wp.func
+    def gap_on_axis(t: float, p_slab: wp.vec3, axis: wp.vec3, half: wp.vec3) -> float:
+        """Distance from the point p + t axis to a slab, divided by t."""
+        point = p_slab + t * axis
+        outside = wp.max(wp.vec3(wp.abs(point[0]), wp.abs(point[1]), wp.abs(point[2])) - half, wp.vec3())
+        return wp.length(outside) / t
 
     @wp.func
     def share_before(
@@ -102,33 +125,37 @@ def make_occlude(order: int) -> SimpleNamespace:
     ) -> float:
         """How far an occluder stands between p and a light: 1 in front of it, 0 behind or beside it."""
         to_light = light_center - p
-        light_distance = wp.length(to_light)
+        light_distance = wp.max(wp.length(to_light), 1.0e-9)
         if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
-            # A face with both the receiver and the whole light before it separates the slab from their rays.
+            # Along the axis of the cone of rays to the light: the distance to the slab in units of the cone's radius.
+            # It has one minimum, which is searched for on a logarithmic scale, as the slab may begin at the receiver.
             to_world = rotation * o.occluders.slab_rotation[entity]
-            origin = position + rotation * o.occluders.slab_center[entity]
-            p_slab = wp.transpose(to_world) * (p - origin)
-            light_slab = wp.transpose(to_world) * (light_center - origin)
+            p_slab = wp.transpose(to_world) * (p - position - rotation * o.occluders.slab_center[entity])
+            axis = wp.transpose(to_world) * to_light
             half = o.occluders.slab_half[entity]
-            skin = wp.static(SLAB_HORIZON) * radius
-            for axis in range(3):
-                side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
-                if (
-                    side * p_slab[axis] > half[axis] - skin
-                    and side * light_slab[axis] - light_radius > half[axis] - skin
+            low = float(wp.static(math.log(SLAB_NEAREST)))
+            high = float(0.0)
+            steps = int(wp.static(SLAB_STEPS))  # a variable keeps the loop from being unrolled
+            for _step in range(steps):
+                third = (high - low) / 3.0
+                if gap_on_axis(wp.exp(low + third), p_slab, axis, half) < gap_on_axis(
+                    wp.exp(high - third), p_slab, axis, half
                 ):
-                    return 0.0
-            return 1.0
+                    high -= third
+                else:
+                    low += third
+            gap = gap_on_axis(wp.exp(0.5 * (low + high)), p_slab, axis, half)
+            return wp.clamp(1.0 - gap / wp.max(light_radius, 1.0e-9), 0.0, 1.0)
         to_center = center - p
-        distance = wp.length(to_center)
-        cosine = wp.dot(to_center, to_light) / wp.max(distance * light_distance, 1.0e-12)
-        apart = wp.acos(wp.clamp(cosine, -1.0, 1.0))
-        size = wp.asin(wp.min(radius / wp.max(distance, 1.0e-9), 1.0))
-        light_size = wp.asin(wp.min(light_radius / wp.max(light_distance, 1.0e-9), 1.0))
-        if apart > size + light_size:
-            return 0.0
+        distance = wp.max(wp.length(to_center), 1.0e-9)
+        apart = wp.acos(wp.clamp(wp.dot(to_center, to_light) / (distance * light_distance), -1.0, 1.0))
+        size = wp.asin(wp.min(radius / distance, 1.0))
+        light_size = wp.asin(wp.min(light_radius / light_distance, 1.0))
+        # From where both cones touch to where the axis of one lies in the other.
+        overlap = wp.clamp((size + light_size - apart) / wp.max(wp.min(size, light_size), 1.0e-6), 0.0, 1.0)
         # Fades over the overlap of both bounding spheres, so that nothing pops as a body passes the light's distance.
-        return wp.clamp(0.5 + (light_distance - distance) / wp.max(light_radius + radius, 1.0e-9), 0.0, 1.0)
+        nearer = wp.clamp(0.5 + (light_distance - distance) / wp.max(light_radius + radius, 1.0e-9), 0.0, 1.0)
+        return overlap * nearer
 
     @wp.func
     def visibility_before(
@@ -149,8 +176,9 @@ def make_occlude(order: int) -> SimpleNamespace:
             rotation = poses.rotation[world, entity]
             radius = geometry.radius[entity]
             center = position + rotation * geometry.center[entity]
-            if matters(entity, own, p, n, center, radius, rotation, o):
-                share = share_before(
+            weight = matters(entity, own, p, n, center, radius, rotation, o)
+            if weight > 0.0:
+                share = weight * share_before(
                     entity, p, center, radius, position, rotation, light_center, geometry.radius[light], o
                 )
                 if share > 0.0:
@@ -187,6 +215,7 @@ def make_occlude(order: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(kit),
         Occlusion=Occlusion,
+        rise_over_horizon=rise_over_horizon,
         visibility_at=visibility_at,
         visibility_before=visibility_before,
         turn_basis=turn_basis,
