@@ -9,6 +9,7 @@ import argparse
 import dataclasses
 import importlib
 import json
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -42,10 +43,8 @@ def settle(name: str):
     model = scene.build()
     model.mat_specular[:] = 0.0
     model.vis.quality.offsamples = 0
-    data = None
-    for data in scene.states(model, 30, MOMENTS[name]):
-        pass
-    return model, data
+    # The last state; a deque of one forgets the others.
+    return model, deque(scene.states(model, 30, MOMENTS[name]), maxlen=1).pop()
 
 
 def render(model, data, environment: psf.Environment, order: int, shading: str, size: tuple[int, int]) -> dict:
@@ -123,7 +122,7 @@ def save_pictures(folder: Path, name: str, found: Comparison) -> None:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=list(MOMENTS))
     parser.add_argument("--orders", nargs="+", type=int, default=[4, 6])
     parser.add_argument("--shading", default="pixel", choices=["pixel", "vertex"])
@@ -144,7 +143,10 @@ def main() -> None:
             found = compare(model, data, environment, order, options.shading, tuple(options.size), reference)
             figures = (found.whole, found.floor, found.contact, found.maximum)
             print(f"{name:10} {order:5} " + " ".join(f"{figure:8.4f}" for figure in figures), flush=True)
-            rows.append({"scene": name, "order": order} | dict(zip(("whole", "floor", "contact", "maximum"), figures)))
+            rows.append(
+                {"scene": name, "order": order}
+                | dict(zip(("whole", "floor", "contact", "maximum"), figures, strict=True))
+            )
             if options.pictures:
                 save_pictures(options.pictures, f"accuracy-{name}-order{order}", found)
     if options.json:

@@ -79,7 +79,7 @@ def lights() -> tuple:
 
 
 def environment() -> psf.Environment:
-    """A third as bright as the soft box."""
+    """Fills the shadows: on the lane, about half of what the soft box gives."""
     return dimmed("studio", 0.33, turn=-math.pi / 2)
 
 

@@ -121,7 +121,7 @@ def lights() -> tuple:
 
 
 def environment() -> psf.Environment:
-    """A third as bright as the window."""
+    """Fills the shadows: on the floor, about half of what the window gives."""
     return dimmed("studio", 0.33)
 
 

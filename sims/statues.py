@@ -72,7 +72,7 @@ def lights() -> tuple:
 
 
 def environment() -> psf.Environment:
-    """A day's sky."""
+    """A dim blue sky, which fills the shadows and is the background."""
     return dimmed("sky", 0.55)
 
 

@@ -164,7 +164,9 @@ def test_an_empty_scene_is_its_background(shading):
 
 def test_an_empty_scene_with_a_light():
     light = psf.rectangle_light("lamp", 1, 1, (2, 2, 2), (0, 0, 0), rotation=np.eye(3))
-    renderer, data = make_renderer('<camera name="down" pos="0 0 1" xyaxes="1 0 0 0 1 0"/>', 5, 5, environment=None, lights=[light])
+    renderer, data = make_renderer(
+        '<camera name="down" pos="0 0 1" xyaxes="1 0 0 0 1 0"/>', 5, 5, environment=None, lights=[light]
+    )
     renderer.update_scene(data, "down")
     np.testing.assert_allclose(renderer.layers()["color"][2, 2], 2.0)
 
@@ -223,7 +225,9 @@ def test_tiny_and_huge_scenes(scale):
 
 def test_bodies_in_one_place():
     # Two equal balls and a box around them: receivers on each lie inside another.
-    renderer, _ = make_renderer(FLOOR + BALL + BALL.replace("ball", "twin") + '<geom type="box" size=".5 .5 .5" pos="0 0 .5"/>', 27, 48)
+    renderer, _ = make_renderer(
+        FLOOR + BALL + BALL.replace("ball", "twin") + '<geom type="box" size=".5 .5 .5" pos="0 0 .5"/>', 27, 48
+    )
     layers = renderer.layers()
     assert np.isfinite(layers["color"]).all()
     assert layers["color"].min() >= 0

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from tests.oracles import make_renderer
+from warp_psf.bake import body as bake_body
+from warp_psf.scene import primitives
 
 HEIGHT, WIDTH = 54, 96
 FLOOR = '<geom name="floor" type="plane" size="9 9 .1" material="white"/>'
@@ -91,9 +93,31 @@ def test_hard_shadow_lies_where_the_ball_hides_the_light(floor, light, toward):
     assert (apart < 0.99).sum() >= 10  # most of the shadow lies below the ball, out of sight
 
 
+def test_a_body_that_bulges_inwards_shadows_itself(monkeypatch):
+    # A floor and a wall in one mesh; the light stands beyond the wall.
+    monkeypatch.setattr(bake_body, "FINEST_RESOLUTION", 16)  # a fraction of the time to bake
+    wall = primitives.box((0.05, 0.5, 0.4), cells=4)
+    base = primitives.box((1.0, 0.5, 0.1), cells=4)
+    vertices = np.concatenate([base.vertices, wall.vertices + np.array((0.0, 0.0, 0.47))])
+    faces = np.concatenate([base.faces, wall.faces + len(base.vertices)])
+    numbers = ['"' + " ".join(map(str, array.ravel())) + '"' for array in (vertices, faces)]
+    header = f"<asset><mesh name='corner' vertex={numbers[0]} face={numbers[1]} inertia='shell'/></asset>"
+    light = f'<light type="directional" dir="-1 0 -1" diffuse="1 1 1" {PLAIN}/>'
+    corner = '<geom name="corner" type="mesh" mesh="corner" material="white"/>'
+    points, found = lit_floor(light, floor=corner, header=header)
+    top = points[:, 2].min() + 0.02  # the base's upper side, lowest of what is seen from above
+    base_top = points[:, 2] < top
+    x = points[base_top, 0] - points[:, 0].mean()
+    lit = found[base_top, 0] > 0
+    # The wall rises 0.75 m above the base: its shadow covers the side away from the light from end to end.
+    assert lit[x > 0.15].all()
+    assert not lit[(x < -0.15) & (x > -0.6)].any()
+    assert min((x > 0.15).sum(), ((x < -0.15) & (x > -0.6)).sum()) > 30
+
+
 def test_no_shadow_from_lights_that_cast_none():
     ball = '<geom type="sphere" size=".4" pos="0 0 .6"/>'
-    light = '<light type="directional" dir="-1 -.5 -2" diffuse="1 1 1" specular="0 0 0" ambient="0 0 0" castshadow="false"/>'
+    light = f'<light type="directional" dir="-1 -.5 -2" diffuse="1 1 1" {PLAIN.replace("true", "false")}/>'
     _, found = lit_floor(light, ball)
     np.testing.assert_allclose(found, 2 / np.sqrt(5.25), rtol=1e-5)
 

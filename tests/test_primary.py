@@ -115,7 +115,9 @@ def test_edges_are_antialiased(degrees):
     inward = np.array((np.cos(angle), np.sin(angle)))
     corner = 0.04 * inward
     center = corner + 50 * inward
-    plane = f'<geom type="plane" size="50 50 .1" pos="{center[0]} {center[1]} 0" euler="0 0 {degrees}" material="white"/>'
+    plane = (
+        f'<geom type="plane" size="50 50 .1" pos="{center[0]} {center[1]} 0" euler="0 0 {degrees}" material="white"/>'
+    )
     renderer, data, layers = picture(plane + DOWN, "down")
     _, rays = camera_rays(renderer, data, "down")
     expected = half_plane_share(corner, inward, rays)
@@ -170,7 +172,8 @@ def test_shares_of_a_pixel_sum_to_one_where_it_is_covered(seen):
 def test_many_bodies_in_one_pixel():
     # A fan of 12 thin boxes that meet under the centre of one pixel: more than a pixel has groups.
     fan = "".join(
-        f'<geom type="box" size=".5 .02 .1" pos="0 0 {0.001 * k}" euler="0 0 {15 * k}" material="white"/>' for k in range(12)
+        f'<geom type="box" size=".5 .02 .1" pos="0 0 {0.001 * k}" euler="0 0 {15 * k}" material="white"/>'
+        for k in range(12)
     )
     plane = '<geom type="plane" size="9 9 .1" pos="0 0 -.3" material="white"/>'
     renderer, _, layers = picture(fan + plane + DOWN, "down", 9, 9)
@@ -202,7 +205,9 @@ def test_background_is_the_environment():
     environment = psf.Environment("noise", random.uniform(0, 2, (16, 32, 3)).astype(np.float32))
     # A wide camera at the origin towards -x, where the azimuth wraps, and up to the zenith.
     wide = '<camera name="wide" pos="0 0 1" xyaxes="0 1 0 .5 0 .87" fovy="120"/>'
-    renderer, data, layers = picture(f'<geom type="sphere" size=".1" pos="5 0 0"/>{wide}', "wide", environment=environment)
+    renderer, data, layers = picture(
+        f'<geom type="sphere" size=".1" pos="5 0 0"/>{wide}', "wide", environment=environment
+    )
     _, rays = camera_rays(renderer, data, "wide")
     assert (layers["segmentation"][..., 0] < 0).all()
     np.testing.assert_allclose(layers["color"], environment.lookup(rays), atol=1e-4)  # float32 angles

@@ -6,7 +6,9 @@ import pytest
 
 import warp_psf as psf
 from tests.oracles import make_model, make_renderer
+from warp_psf.bake import body as bake_body
 from warp_psf.basis import sh, sphere
+from warp_psf.scene import primitives
 
 HEIGHT, WIDTH = 54, 96
 CAMERA = '<camera name="front" pos="0 -5 2.5" xyaxes="1 0 0 0 .45 .9"/>'
@@ -82,7 +84,9 @@ def test_layers(scene):
     for name in ("color", "direct", "albedo", "normal"):
         assert (layers[name].dtype, layers[name].shape) == (np.float32, (HEIGHT, WIDTH, 3))
         assert np.isfinite(layers[name]).all()
-    np.testing.assert_allclose(np.linalg.norm(layers["normal"], axis=2)[layers["segmentation"][..., 0] >= 0], 1, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(layers["normal"], axis=2)[layers["segmentation"][..., 0] >= 0], 1, atol=1e-5
+    )
     # They are the caller's own.
     layers["color"][:] = 0
     assert renderer.layers()["color"].any()
@@ -109,15 +113,15 @@ def test_nothing_to_render_yet():
             use()
 
 
-def test_a_closed_renderer_says_so():
-    for shading in ("pixel", "vertex"):
-        renderer, data = make_renderer(SCENE, 4, 4, shading=shading)
-        with renderer:
-            renderer.render()
-        renderer.close()
-        for use in (renderer.render, renderer.layers, lambda r=renderer: r.update_scene(data)):
-            with pytest.raises(RuntimeError, match="closed"):
-                use()
+@pytest.mark.parametrize("shading", ["pixel", "vertex"])
+def test_a_closed_renderer_says_so(shading):
+    renderer, data = make_renderer(SCENE, 4, 4, shading=shading)
+    with renderer:
+        renderer.render()
+    renderer.close()
+    for use in (renderer.render, renderer.layers, lambda: renderer.update_scene(data)):
+        with pytest.raises(RuntimeError, match="closed"):
+            use()
 
 
 def test_cameras_by_id_name_and_object(scene):
@@ -143,7 +147,14 @@ def test_stages_are_timed(scene):
     renderer.update_scene(data, "front")
     renderer.render()
     stages = renderer.stage_seconds
-    assert list(stages) == ["primary visibility", "turn fields", "shadow fields", "shadow rays", "resolve pixels", "display"]
+    assert list(stages) == [
+        "primary visibility",
+        "turn fields",
+        "shadow fields",
+        "shadow rays",
+        "resolve pixels",
+        "display",
+    ]
     assert all(seconds >= 0 for seconds in stages.values())
     assert renderer.occluders == 3
     assert renderer.vertices > 1000
@@ -155,6 +166,16 @@ def test_progress_is_told():
     psf.Renderer(model, 4, 4, progress=lambda what, share: told.append((what, share)))
     assert told[-1][1] == 1.0
     assert all(what.startswith("baking ") and 0 <= share <= 1 for what, share in told)
+
+
+def test_shapes_of_lights_are_not_baked_as_occluders(monkeypatch):
+    monkeypatch.setattr(bake_body, "FINEST_RESOLUTION", 16)  # a fraction of the time to bake
+    model, _ = make_model(SCENE)
+    told = []
+    tube = psf.AreaLight("tube", primitives.capsule(0.4, 0.6), (1, 1, 1))
+    renderer = psf.Renderer(model, 4, 4, lights=[tube], progress=lambda what, share: told.append(what))
+    assert set(told) == {"baking plane", "baking sphere", "baking box"}
+    assert renderer.occluders == 3
 
 
 def test_exposure_and_view():

@@ -78,5 +78,3 @@ def _quiet_start() -> None:
     # Compiling the adjoint of every kernel doubles the first run's wait; who differentiates a kernel turns it on.
     wp.config.enable_backward = False
     wp.init()
-
-

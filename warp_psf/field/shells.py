@@ -131,7 +131,6 @@ def make_fields(order: int) -> SimpleNamespace:
         samples: wp.array(dtype=vec), near: wp.vec4i, near_shares: wp.vec4, far: wp.vec4i, far_shares: wp.vec4
     ) -> vec:
         """The sum of four samples of one shell and four of the next."""
-        ...
 
     @wp.func
     def nearest_four(first: int, resolution: int, theta: float, phi: float):

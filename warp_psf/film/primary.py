@@ -96,9 +96,7 @@ def camera_ray(camera: CameraTable, world: int, x: float, y: float) -> wp.vec3:
 
 
 @wp.kernel(module="unique")
-def _fill_tiles(
-    first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, tiles: TileTable
-):
+def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, tiles: TileTable):
     world, tile = wp.tid()
     tile += first
     size = float(wp.static(TILE))
@@ -324,9 +322,7 @@ def _trace_edges(
             receivers.entity[world, slot + group - 1] = -1
 
 
-def make_surfaces(
-    worlds: int, width: int, height: int, entities: int, antialias: bool, device: wp.Device
-) -> Surfaces:
+def make_surfaces(worlds: int, width: int, height: int, entities: int, antialias: bool, device: wp.Device) -> Surfaces:
     """Room for the surfaces of a film of width x height pixels; without `antialias` a pixel is its centre."""
     pixels = width * height
     capacity = math.ceil(EDGE_SHARE * pixels) if antialias else 0
@@ -370,5 +366,14 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     wp.utils.array_scan(surfaces.edge.flatten(), surfaces.edge_rank.flatten(), inclusive=False)
     # What an earlier frame left in slots that this frame's edges do not reach.
     receivers.entity[:, dim[1] :].fill_(-1)
-    inputs = [scene.geometry, scene.poses, camera, tiles, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, receivers]
+    inputs = [
+        scene.geometry,
+        scene.poses,
+        camera,
+        tiles,
+        surfaces.edge,
+        surfaces.edge_rank,
+        surfaces.edge_capacity,
+        receivers,
+    ]
     launch(_trace_edges, dim, inputs, [surfaces.extra], device)

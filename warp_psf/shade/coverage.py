@@ -47,10 +47,10 @@ def make_coverage(order: int) -> SimpleNamespace:
         coefficients[0] = 0.5 * (1.0 - x)
         before = float(1.0)
         now = x
-        for l in range(1, wp.static(order)):
-            n = float(l)
+        for band in range(1, wp.static(order)):
+            n = float(band)
             after = ((2.0 * n + 1.0) * x * now - n * before) / (n + 1.0)
-            coefficients[l] = 0.5 * (before - after)
+            coefficients[band] = 0.5 * (before - after)
             before = now
             now = after
         return kit.zonal_at_directions(coefficients, axis, quadrature)

@@ -14,8 +14,10 @@ from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
+from warp_psf.shade.area import make_area
 from warp_psf.shade.directions import basis_at_directions, quadrature_weights
 from warp_psf.shade.occlude import OcclusionState, make_occlude
+
 
 @cache
 def make_direct(order: int) -> SimpleNamespace:
@@ -23,6 +25,7 @@ def make_direct(order: int) -> SimpleNamespace:
     kit = make_occlude(order)
     vec, values, half_values = kit.vec, kit.values, kit.half_values
     Occlusion = kit.Occlusion
+    area = make_area(order)
     profile = kit.profile
     # The closed forms of the transfer are not stored, so they may have a band more than the fields: the clamped
     # cosine's last large coefficient is that of l = 4. The quadrature is exact for it.
@@ -42,6 +45,12 @@ def make_direct(order: int) -> SimpleNamespace:
         self_visibility: wp.array(dtype=vec)  # (transfer vertex)
         first_transfer: wp.array(dtype=wp.int32)  # (entity): -1 for convex bodies
         lobe: wp.array(dtype=profile)  # (entity): Phong lobe, coefficients of Legendre polynomials
+
+    @wp.func
+    def mirror(eye: wp.vec3, p: wp.vec3, n: wp.vec3) -> wp.vec3:
+        """The direction from which a mirror at p would send light to the eye."""
+        view = wp.normalize(eye - p)
+        return 2.0 * wp.dot(n, view) * n - view
 
     @wp.func
     def interpolate(
@@ -88,15 +97,18 @@ def make_direct(order: int) -> SimpleNamespace:
         glossy = wp.max(geometry.specular[entity]) > 0.0
         lobe = values()
         if glossy:
-            view = wp.normalize(lighting.eye[world] - p)
-            mirrored = 2.0 * wp.dot(n, view) * n - view
+            mirrored = mirror(lighting.eye[world], p, n)
             lobe = kit.zonal_at_directions(lighting.lobe[entity], mirrored, o.quadrature)
             if start >= 0:
                 lobe = wp.cw_mul(lobe, interpolate(lighting.self_visibility, start, corners, uv, rows))
             else:
                 lobe = wp.cw_mul(lobe, kit.cap_coverage(n, 0.0, o.quadrature))
 
-        visible = kit.visibility_at(world, entity, p, n, geometry, poses, o)
+        lights = lighting.light_entity.shape[0]
+        first_light = int(-1)
+        if lights > 0:
+            first_light = lighting.light_entity[0]
+        visible, before = kit.visibility_at(world, entity, first_light, p, n, geometry, poses, o)
         received = wp.cw_mul(visible, transfer)
         diffuse = wp.vec3(
             kit.sum_of_products(lighting.environment[world, 0], received),
@@ -112,36 +124,56 @@ def make_direct(order: int) -> SimpleNamespace:
                 kit.sum_of_products(lighting.environment[world, 2], received),
             )
 
-        for light in range(lighting.light_entity.shape[0]):
+        open_to_self = values(1.0)
+        if start >= 0 and lights > 0:
+            # 1 minus what the body itself blocks above the horizon.
+            open_to_self += interpolate(lighting.self_visibility, start, corners, uv, rows)
+            open_to_self -= kit.cap_coverage(n, 0.0, o.quadrature)
+        for light in range(lights):
             shining = lighting.light_entity[light]
             rotation = poses.rotation[world, shining]
             position = poses.position[world, shining]
+            radius = geometry.radius[shining]
             center = position + rotation * geometry.center[shining]
             facing = rotation * lighting.light_facing[light]
-            risen = kit.rise_over_horizon(wp.dot(n, center - p), geometry.radius[shining])
-            lit = risen > 0.0 and shining != entity
+            lit = wp.dot(n, center - p) > -radius and shining != entity
             if wp.length_sq(facing) > 0.0:
                 lit = lit and wp.dot(facing, p - center) > 0.0
             if lit:
+                if light > 0:
+                    _all, before = kit.visibility_at(world, entity, shining, p, n, geometry, poses, o)
                 seen = kit.coverage_of(
                     shining,
                     p,
                     position,
                     rotation,
                     geometry.center[shining],
-                    geometry.radius[shining],
+                    radius,
                     o.occluders,
                     o.fields,
                     o.rows[world, shining],
                     o.quadrature,
                 )
-                visible = kit.visibility_before(world, entity, shining, p, n, geometry, poses, o)
-                weighted = wp.cw_mul(wp.cw_mul(seen, visible), lighting.weights[0])
-                radiance = risen * lighting.light_radiance[world, light]
-                # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
-                diffuse += wp.max(kit.sum_of_products(weighted, transfer), 0.0) * radiance
+                weighted = wp.cw_mul(seen, lighting.weights[0])
+                passed = kit.sum_of_products(weighted, wp.cw_mul(before, open_to_self))
+                share = wp.clamp(passed / wp.max(kit.sum_of_products(weighted, values(1.0)), 1.0e-9), 0.0, 1.0)
+                unhindered = area.area_irradiance(shining, p, n, position, rotation, center, radius, o.occluders)
+                if unhindered < 0.0:
+                    unhindered = wp.max(
+                        kit.sum_of_products(
+                            weighted, kit.zonal_at_directions(wp.static(cosine_profile), n, o.quadrature)
+                        ),
+                        0.0,
+                    )
+                radiance = share * lighting.light_radiance[world, light]
+                diffuse += unhindered * radiance
                 if glossy:
-                    reflected += wp.max(kit.sum_of_products(weighted, lobe), 0.0) * radiance
+                    mirrored = mirror(lighting.eye[world], p, n)
+                    exponent = geometry.exponent[entity]
+                    shine = area.area_gloss(shining, p, n, mirrored, exponent, position, rotation, o.occluders)
+                    if shine < 0.0:
+                        shine = wp.max(kit.sum_of_products(weighted, lobe), 0.0)
+                    reflected += shine * radiance
 
         zero = wp.vec3()
         diffuse_out[world, receiver] = wp.max(diffuse, zero)

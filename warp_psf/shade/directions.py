@@ -38,19 +38,14 @@ def make_directions(order: int) -> SimpleNamespace:
     @wp.func_native(_sum_of_products_snippet(points))
     def sum_of_products(a: values, b: values) -> float:
         """The dot product."""
-        ...
 
     @wp.func_native(_at_directions_snippet(order, points))
     def at_directions(v: vec, rows: wp.array(dtype=half_values)) -> values:
         """An SH vector -> its values, with the rows y_k at the first half of the directions."""
-        ...
 
     @wp.func_native(_zonal_snippet(order, points))
-    def zonal_at_directions(
-        coefficients: profile, axis: wp.vec3, quadrature: wp.array(dtype=half_values)
-    ) -> values:
+    def zonal_at_directions(coefficients: profile, axis: wp.vec3, quadrature: wp.array(dtype=half_values)) -> values:
         """The values of sum_l c_l P_l(cosine to a unit axis)."""
-        ...
 
     return SimpleNamespace(
         order=order,

@@ -48,7 +48,7 @@ def _begin(
         turn = wp.static(INTERPOLATED)
     elif slot >= extra.shape[1] or extra[world, slot] >= 0:
         turn = 1
-    elif (slot % width) % wp.static(STRIDES[0]) == 0 and (slot / width) % wp.static(STRIDES[0]) == 0:
+    elif slot % width % wp.static(STRIDES[0]) == 0 and slot / width % wp.static(STRIDES[0]) == 0:
         turn = 1
     turns_out[world, slot] = turn
 

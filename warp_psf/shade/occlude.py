@@ -1,6 +1,5 @@
 """Composing occluders: the visibility that the bodies around a receiver leave, at the directions of a quadrature."""
 
-import math
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -27,15 +26,14 @@ HORIZON_FADE = 0.6
 # A slab whose corners rise above the receiver's tangent plane by less than this share of its half-diagonal counts as
 # below it: the floor beside a receiver on the same floor.
 SLAB_HORIZON = 1.0e-5
-# The search for where a slab comes nearest to the rays to a light begins at this share of the light's distance, and
-# each step cuts the interval by a third: to 1 %.
-SLAB_NEAREST = 1.0e-3
-SLAB_STEPS = 16
+# A slab with a receiver and a light on the same side of one of its faces cannot stand between them. It fades in over
+# this share of the light's radius as one of them nears the face.
+SLAB_FADE = 0.25
 
 
 @cache
 def make_occlude(order: int) -> SimpleNamespace:
-    """Device functions for `order` bands: `visibility_at` and `visibility_before`, and their tables."""
+    """Device functions for `order` bands: `visibility_at` and its tables."""
     kit = make_coverage(order)
     values, half_values = kit.values, kit.half_values
     OccluderTable, FieldTable = kit.OccluderTable, kit.FieldTable
@@ -77,11 +75,58 @@ def make_occlude(order: int) -> SimpleNamespace:
         return rise_over_horizon(height, radius) * wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
 
     @wp.func
+    def nearness(
+        entity: int,
+        p: wp.vec3,
+        center: wp.vec3,
+        radius: float,
+        position: wp.vec3,
+        rotation: wp.mat33,
+        light_center: wp.vec3,
+        light_radius: float,
+        o: Occlusion,
+    ) -> float:
+        """How far an entity is nearer to p than a light: 1 in front of it, 0 behind it, smooth between."""
+        if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
+            to_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity])
+            origin = position + rotation * o.occluders.slab_center[entity]
+            p_slab = to_slab * (p - origin)
+            light_slab = to_slab * (light_center - origin)
+            half = o.occluders.slab_half[entity]
+            apart = float(-1.0e30)
+            for axis in range(3):
+                side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
+                ahead = wp.min(side * p_slab[axis], side * light_slab[axis] - light_radius) - half[axis]
+                apart = wp.max(apart, ahead)
+            return 1.0 - wp.clamp(apart / wp.max(wp.static(SLAB_FADE) * light_radius, 1.0e-9), 0.0, 1.0)
+        return wp.clamp(
+            0.5 + (wp.length(light_center - p) - wp.length(center - p)) / wp.max(light_radius + radius, 1.0e-9),
+            0.0,
+            1.0,
+        )
+
+    @wp.func
     def visibility_at(
-        world: int, own: int, p: wp.vec3, n: wp.vec3, geometry: GeometryTable, poses: PoseTable, o: Occlusion
-    ) -> values:
-        """Visibility past every entity but `own`: the product of what each leaves."""
+        world: int,
+        own: int,
+        light: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+    ):
+        """Visibility past every entity but `own`, and past those nearer than the entity `light` (-1: not asked for).
+
+        Each is the product of what the entities leave (Zhou 2005; Tamura 2006, Figure 3).
+        """
         visible = values(1.0)
+        before = values(1.0)
+        light_center = wp.vec3()
+        light_radius = float(0.0)
+        if light >= 0:
+            light_center = poses.position[world, light] + poses.rotation[world, light] * geometry.center[light]
+            light_radius = geometry.radius[light]
         for entity in range(geometry.entity_mesh.shape[0]):
             position = poses.position[world, entity]
             rotation = poses.rotation[world, entity]
@@ -102,100 +147,10 @@ def make_occlude(order: int) -> SimpleNamespace:
                     o.quadrature,
                 )
                 visible = wp.cw_mul(visible, values(1.0) - weight * covered)
-        return visible
-
-    @wp.func
-    def gap_on_axis(t: float, p_slab: wp.vec3, axis: wp.vec3, half: wp.vec3) -> float:
-        """Distance from the point p + t axis to a slab, divided by t."""
-        point = p_slab + t * axis
-        outside = wp.max(wp.vec3(wp.abs(point[0]), wp.abs(point[1]), wp.abs(point[2])) - half, wp.vec3())
-        return wp.length(outside) / t
-
-    @wp.func
-    def share_before(
-        entity: int,
-        p: wp.vec3,
-        center: wp.vec3,
-        radius: float,
-        position: wp.vec3,
-        rotation: wp.mat33,
-        light_center: wp.vec3,
-        light_radius: float,
-        o: Occlusion,
-    ) -> float:
-        """How far an occluder stands between p and a light: 1 in front of it, 0 behind or beside it."""
-        to_light = light_center - p
-        light_distance = wp.max(wp.length(to_light), 1.0e-9)
-        if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
-            # Along the axis of the cone of rays to the light: the distance to the slab in units of the cone's radius.
-            # It has one minimum, which is searched for on a logarithmic scale, as the slab may begin at the receiver.
-            to_world = rotation * o.occluders.slab_rotation[entity]
-            p_slab = wp.transpose(to_world) * (p - position - rotation * o.occluders.slab_center[entity])
-            axis = wp.transpose(to_world) * to_light
-            half = o.occluders.slab_half[entity]
-            low = float(wp.static(math.log(SLAB_NEAREST)))
-            high = float(0.0)
-            steps = int(wp.static(SLAB_STEPS))  # a variable keeps the loop from being unrolled
-            for _step in range(steps):
-                third = (high - low) / 3.0
-                if gap_on_axis(wp.exp(low + third), p_slab, axis, half) < gap_on_axis(
-                    wp.exp(high - third), p_slab, axis, half
-                ):
-                    high -= third
-                else:
-                    low += third
-            gap = gap_on_axis(wp.exp(0.5 * (low + high)), p_slab, axis, half)
-            return wp.clamp(1.0 - gap / wp.max(light_radius, 1.0e-9), 0.0, 1.0)
-        to_center = center - p
-        distance = wp.max(wp.length(to_center), 1.0e-9)
-        apart = wp.acos(wp.clamp(wp.dot(to_center, to_light) / (distance * light_distance), -1.0, 1.0))
-        size = wp.asin(wp.min(radius / distance, 1.0))
-        light_size = wp.asin(wp.min(light_radius / light_distance, 1.0))
-        # From where both cones touch to where the axis of one lies in the other.
-        overlap = wp.clamp((size + light_size - apart) / wp.max(wp.min(size, light_size), 1.0e-6), 0.0, 1.0)
-        # Fades over the overlap of both bounding spheres, so that nothing pops as a body passes the light's distance.
-        nearer = wp.clamp(0.5 + (light_distance - distance) / wp.max(light_radius + radius, 1.0e-9), 0.0, 1.0)
-        return overlap * nearer
-
-    @wp.func
-    def visibility_before(
-        world: int,
-        own: int,
-        light: int,
-        p: wp.vec3,
-        n: wp.vec3,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-    ) -> values:
-        """Visibility of the light `light` past the entities nearer than it (Zhou 2005; Tamura 2006, Figure 3)."""
-        light_center = poses.position[world, light] + poses.rotation[world, light] * geometry.center[light]
-        visible = values(1.0)
-        for entity in range(geometry.entity_mesh.shape[0]):
-            position = poses.position[world, entity]
-            rotation = poses.rotation[world, entity]
-            radius = geometry.radius[entity]
-            center = position + rotation * geometry.center[entity]
-            weight = matters(entity, own, p, n, center, radius, rotation, o)
-            if weight > 0.0:
-                share = weight * share_before(
-                    entity, p, center, radius, position, rotation, light_center, geometry.radius[light], o
-                )
-                if share > 0.0:
-                    covered = kit.coverage_of(
-                        entity,
-                        p,
-                        position,
-                        rotation,
-                        geometry.center[entity],
-                        radius,
-                        o.occluders,
-                        o.fields,
-                        o.rows[world, entity],
-                        o.quadrature,
-                    )
-                    visible = wp.cw_mul(visible, values(1.0) - share * covered)
-        return visible
+                if light >= 0:
+                    weight *= nearness(entity, p, center, radius, position, rotation, light_center, light_radius, o)
+                    before = wp.cw_mul(before, values(1.0) - weight * covered)
+        return visible, before
 
     @wp.kernel(module="unique")
     def turn_basis(
@@ -217,7 +172,6 @@ def make_occlude(order: int) -> SimpleNamespace:
         Occlusion=Occlusion,
         rise_over_horizon=rise_over_horizon,
         visibility_at=visibility_at,
-        visibility_before=visibility_before,
         turn_basis=turn_basis,
     )
 

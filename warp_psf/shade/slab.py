@@ -66,10 +66,10 @@ def _edge_tables() -> dict[str, np.ndarray]:
 def _silhouette_snippet(order: int, points: int) -> str:
     """C++: first all edges side by side, then for those on the silhouette all directions side by side."""
     half = points // 2
-    tables = "\n".join(
-        f"const float {name}[3][{LANES}] = {{{', '.join('{' + ', '.join(f'{x:.1f}f' for x in row) + '}' for row in table)}}};"
-        for name, table in _edge_tables().items()
-    )
+    tables = ""
+    for name, table in _edge_tables().items():
+        rows = ", ".join("{" + ", ".join(f"{sign:.1f}f" for sign in row) + "}" for row in table)
+        tables += f"const float {name}[3][{LANES}] = {{{rows}}};\n"
     arc_tangent = f"{sphere.ARC_TANGENT[-1]:.9e}f"
     for coefficient in sphere.ARC_TANGENT[-2::-1]:
         arc_tangent = f"({arc_tangent} * u * u + {coefficient:.9e}f)"
@@ -94,10 +94,10 @@ def _silhouette_snippet(order: int, points: int) -> str:
         // turned so that the box lies to its left.
         const float ahead_u = face_u[0][i] * p[0] + face_u[1][i] * p[1] + face_u[2][i] * p[2];
         const float ahead_v = face_v[0][i] * p[0] + face_v[1][i] * p[1] + face_v[2][i] * p[2];
-        const float reach_u =
-            face_u[0][i] * face_u[0][i] * half[0] + face_u[1][i] * face_u[1][i] * half[1] + face_u[2][i] * face_u[2][i] * half[2];
-        const float reach_v =
-            face_v[0][i] * face_v[0][i] * half[0] + face_v[1][i] * face_v[1][i] * half[1] + face_v[2][i] * face_v[2][i] * half[2];
+        const float reach_u = face_u[0][i] * face_u[0][i] * half[0]
+            + face_u[1][i] * face_u[1][i] * half[1] + face_u[2][i] * face_u[2][i] * half[2];
+        const float reach_v = face_v[0][i] * face_v[0][i] * half[0]
+            + face_v[1][i] * face_v[1][i] * half[1] + face_v[2][i] * face_v[2][i] * half[2];
         const float side_u = face_u[0][i] + face_u[1][i] + face_u[2][i];
         const float side_v = face_v[0][i] + face_v[1][i] + face_v[2][i];
         const float sees_u = ahead_u > reach_u ? 1.0f : 0.0f, sees_v = ahead_v > reach_v ? 1.0f : 0.0f;
