@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 
 import warp as wp
@@ -77,4 +80,39 @@ def _quiet_start() -> None:
     wp.config.log_level = wp.LOG_ERROR
     # Compiling the adjoint of every kernel doubles the first run's wait; who differentiates a kernel turns it on.
     wp.config.enable_backward = False
-    wp.init()
+    with _without_driver_warning():
+        wp.init()
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Keeps back Warp's warning that there is no CUDA driver, on machines that have none and need none.
+
+    The warning is written by C code, past Python's stderr; only the file descriptor can be turned away.
+    """
+    if _has_cuda_driver():
+        yield
+        return
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # a process without stderr has nothing to keep clean
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _has_cuda_driver() -> bool:
+    for library in ("libcuda.so.1", "nvcuda.dll"):
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return True
+    return False
