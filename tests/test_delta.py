@@ -167,8 +167,8 @@ def test_highlight_is_the_lobe_about_the_mirror_direction(shininess):
     mirrored = view * (-1, -1, 1)
     aligned = mirrored @ np.array((2, 0, 0.5)) / np.sqrt(4.25)
     exponent = 32 * shininess
-    # The bridge gives the lobe the reflectance 2/(n + 2), and the lobe is (n + 2)/2 high.
-    expected = np.where(aligned > 0, np.maximum(aligned, 0) ** exponent, 0)
+    # The bridge gives the lobe the reflectance 2/(n + 2), the lobe is (n + 2)/2 high, and the light comes in aslant.
+    expected = np.where(aligned > 0, np.maximum(aligned, 0) ** exponent, 0) * 0.5 / np.sqrt(4.25)
     clear = np.abs(aligned) > 1e-4
     assert (aligned < 0).any()
     np.testing.assert_allclose(found[clear, 0], expected[clear], atol=1e-5)

@@ -4,8 +4,8 @@ import warnings
 
 import numpy as np
 import pytest
-from mesh_measures import CUBE_FACES, PRIMITIVES, moved, rotation, triangles
 
+from tests.mesh_measures import CUBE_FACES, PRIMITIVES, moved, rotation, triangles
 from warp_psf.scene.fit import bounding_sphere
 from warp_psf.scene.mesh import make_mesh
 from warp_psf.scene.primitives import box, cylinder, ellipsoid, plane, sphere

@@ -5,7 +5,8 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
-from mesh_measures import (
+
+from tests.mesh_measures import (
     CUBE_FACES,
     CUBE_VERTICES,
     PRIMITIVES,
@@ -16,7 +17,6 @@ from mesh_measures import (
     triangles,
     volume,
 )
-
 from warp_psf.scene.mesh import load_mesh, make_mesh, tessellate
 from warp_psf.scene.primitives import box, sphere
 

@@ -4,8 +4,8 @@ import warnings
 
 import numpy as np
 import pytest
-from mesh_measures import PRIMITIVES, area, area_vectors, has_closed_edges, volume
 
+from tests.mesh_measures import PRIMITIVES, area, area_vectors, has_closed_edges, volume
 from warp_psf.scene.primitives import SEGMENTS, box, capsule, cylinder, ellipsoid, plane, sphere
 
 

@@ -299,8 +299,9 @@ def _geom_material(model: mujoco.MjModel, geom: int, material_space: str) -> tup
     The colour is the geom's own; only where that is MuJoCo's default does the material's count (as in MuJoCo's
     visualiser). A texture counts with its mean colour. The classic renderer adds specular * cos^(128 shininess) of the
     angle at the half vector; here that is a Phong lobe about the mirror direction of a quarter of that exponent n, with
-    the reflectance 2 specular / (n + 2), which gives the highlight of a light the same height. Where the sum of both
-    reflectances exceeds 1 both are scaled down. MuJoCo's emission times the colour is the radiance sent out.
+    the reflectance 2 specular / (n + 2), which gives the highlight of a light straight ahead the same height. Where the
+    sum of both reflectances exceeds 1 both are scaled down. MuJoCo's emission times the colour is the radiance sent
+    out.
     """
     rgba, index = model.geom_rgba[geom], int(model.geom_matid[geom])
     specular, shininess, emission, tint = DEFAULT_SPECULAR, DEFAULT_SHININESS, 0.0, np.ones(3)

@@ -107,8 +107,11 @@ def find_flips(points: np.ndarray, faces: np.ndarray, pairs: tuple[np.ndarray, n
 def has_convex_edges(points: np.ndarray, faces: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]) -> bool:
     """Whether a closed, outward surface is of one piece and bends inwards at none of its edges."""
     one, other = pairs
-    # Euler: convex pieces have 2 each, so 2 means one piece; an edge of four faces is no pair and breaks the count.
+    # Euler's count is 2 for a convex piece; an edge of four faces is no pair and breaks it. Pieces that touch at points
+    # can add up to 2 as well: they have no edge in common.
     if len(np.unique(faces)) - len(one) + len(faces) != 2 or 2 * len(one) != faces.size:
+        return False
+    if np.unique(find_components(len(faces), one // 3, other // 3)).size != 1:
         return False
     corner = points[faces]
     vectors = area_vectors(points, faces)

@@ -137,9 +137,11 @@ def make_area(order: int) -> SimpleNamespace:
                 toward = middle + to_world * wp.vec3(x * half[0], y * half[1], 0.0) - p
                 squared = wp.max(wp.length_sq(toward), 1.0e-12)
                 toward = toward / wp.sqrt(squared)
-                if wp.dot(n, toward) > 0.0:
+                cosine = wp.dot(n, toward)
+                aligned = wp.dot(mirrored, toward)
+                if cosine > 0.0 and aligned > 0.0:
                     solid_angle = patch * wp.abs(wp.dot(facing, toward)) / squared
-                    total += wp.pow(wp.max(wp.dot(mirrored, toward), 0.0), exponent) * solid_angle
+                    total += cosine * wp.pow(aligned, exponent) * solid_angle
         return 0.5 * (exponent + 2.0) / wp.pi * total
 
     return SimpleNamespace(area_irradiance=area_irradiance, area_gloss=area_gloss)

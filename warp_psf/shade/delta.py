@@ -156,7 +156,7 @@ def _add_delta_lights(
             # Behind the mirror direction there is nothing, though 0^0 is 1.
             if aligned > 0.0:
                 lobe = 0.5 * (exponent + 2.0) * wp.pow(aligned, exponent)
-                glossy += (strength * lit * lobe) * lights.specular[world, light]
+                glossy += (strength * lit * cosine * lobe) * lights.specular[world, light]
     diffuse_out[world, receiver] = diffuse_out[world, receiver] + diffuse
     glossy_out[world, receiver] = glossy_out[world, receiver] + glossy
 

@@ -26,9 +26,10 @@ HORIZON_FADE = 0.6
 # A slab whose corners rise above the receiver's tangent plane by less than this share of its half-diagonal counts as
 # below it: the floor beside a receiver on the same floor.
 SLAB_HORIZON = 1.0e-5
-# A slab with a receiver and a light on the same side of one of its faces cannot stand between them. It fades in over
-# this share of the light's radius as one of them nears the face.
-SLAB_FADE = 0.25
+# What can stand between a receiver and a light and what cannot is told by planes: of a slab's faces, when both lie
+# before one, and of a flat light, when an occluder lies behind it. At a plane occluders fade over this share of the
+# light's radius.
+LIGHT_FADE = 0.25
 
 
 @cache
@@ -84,9 +85,25 @@ def make_occlude(order: int) -> SimpleNamespace:
         rotation: wp.mat33,
         light_center: wp.vec3,
         light_radius: float,
+        light_facing: wp.vec3,
         o: Occlusion,
     ) -> float:
         """How far an entity is nearer to p than a light: 1 in front of it, 0 behind it, smooth between."""
+        # Nothing behind a flat light's plane stands in its way, however near it is: a ceiling above a lamp. What comes
+        # out from behind fades in.
+        ahead_of_light = wp.dot(light_facing, center - light_center)
+        if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
+            half = o.occluders.slab_half[entity]
+            facing_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity]) * light_facing
+            ahead_of_light += (
+                wp.abs(facing_slab[0]) * half[0] + wp.abs(facing_slab[1]) * half[1] + wp.abs(facing_slab[2]) * half[2]
+            )
+        else:
+            ahead_of_light += radius
+        fade = wp.max(wp.static(LIGHT_FADE) * light_radius, 1.0e-9)
+        before = float(1.0)
+        if wp.length_sq(light_facing) > 0.0:
+            before = wp.clamp(ahead_of_light / fade, 0.0, 1.0)
         if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
             to_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity])
             origin = position + rotation * o.occluders.slab_center[entity]
@@ -98,8 +115,8 @@ def make_occlude(order: int) -> SimpleNamespace:
                 side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
                 ahead = wp.min(side * p_slab[axis], side * light_slab[axis] - light_radius) - half[axis]
                 apart = wp.max(apart, ahead)
-            return 1.0 - wp.clamp(apart / wp.max(wp.static(SLAB_FADE) * light_radius, 1.0e-9), 0.0, 1.0)
-        return wp.clamp(
+            return before * (1.0 - wp.clamp(apart / fade, 0.0, 1.0))
+        return before * wp.clamp(
             0.5 + (wp.length(light_center - p) - wp.length(center - p)) / wp.max(light_radius + radius, 1.0e-9),
             0.0,
             1.0,
@@ -110,6 +127,7 @@ def make_occlude(order: int) -> SimpleNamespace:
         world: int,
         own: int,
         light: int,
+        light_facing: wp.vec3,
         p: wp.vec3,
         n: wp.vec3,
         geometry: GeometryTable,
@@ -118,7 +136,8 @@ def make_occlude(order: int) -> SimpleNamespace:
     ):
         """Visibility past every entity but `own`, and past those nearer than the entity `light` (-1: not asked for).
 
-        Each is the product of what the entities leave (Zhou 2005; Tamura 2006, Figure 3).
+        light_facing: the side to which a flat light shines, in the world; zero for others. Each visibility is the
+        product of what the entities leave (Zhou 2005; Tamura 2006, Figure 3).
         """
         visible = values(1.0)
         before = values(1.0)
@@ -148,7 +167,9 @@ def make_occlude(order: int) -> SimpleNamespace:
                 )
                 visible = wp.cw_mul(visible, values(1.0) - weight * covered)
                 if light >= 0:
-                    weight *= nearness(entity, p, center, radius, position, rotation, light_center, light_radius, o)
+                    weight *= nearness(
+                        entity, p, center, radius, position, rotation, light_center, light_radius, light_facing, o
+                    )
                     before = wp.cw_mul(before, values(1.0) - weight * covered)
         return visible, before
 
