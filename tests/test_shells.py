@@ -189,7 +189,7 @@ def test_outside_the_bounding_sphere_solid_angle_is_interpolated_exactly():
 
 def test_an_empty_table_can_be_uploaded():
     table = upload_fields([], ORDER, find_device("cpu"))
-    assert table.samples.shape == (0,)
+    assert table.codes.shape == (0,)
     assert table.shell_first.shape == (0, SHELL_COUNT)
 
 

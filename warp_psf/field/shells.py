@@ -114,13 +114,17 @@ def quantise(center: np.ndarray, radius: float, shells: list[np.ndarray]) -> Sha
 def make_fields(order: int) -> SimpleNamespace:
     """The device side of fields with `order` bands: the struct `FieldTable` and the function `lookup_coverage`.
 
-    `FieldTable` holds the fields of all bodies behind one another, dequantised: a fetch is then one vector load.
+    `FieldTable` holds the fields of all bodies behind one another, in 8 bits as they are stored: eight samples of a
+    body that is looked up then lie closer to a core than floats would.
     """
     vec = sh.make_sh(order).vec
+    code = wp.types.vector(order * order, wp.uint8)
 
     @wp.struct
     class FieldTable:
-        samples: wp.array(dtype=vec)  # (sample)
+        codes: wp.array(dtype=code)  # (sample)
+        minimum: wp.array2d(dtype=vec)  # (field, shell): coefficient = minimum + step * code
+        step: wp.array2d(dtype=vec)  # (field, shell)
         shell_first: wp.array2d(dtype=wp.int32)  # (field, shell): index of the shell's first sample
         shell_resolution: wp.array2d(dtype=wp.int32)  # (field, shell)
         center: wp.array(dtype=wp.vec3)  # (field), in the body's frame
@@ -128,9 +132,16 @@ def make_fields(order: int) -> SimpleNamespace:
 
     @wp.func_native(_blend_snippet(order))
     def blend(
-        samples: wp.array(dtype=vec), near: wp.vec4i, near_shares: wp.vec4, far: wp.vec4i, far_shares: wp.vec4
+        codes: wp.array(dtype=code),
+        minimum: wp.array(dtype=vec),
+        step: wp.array(dtype=vec),
+        shell: int,
+        near: wp.vec4i,
+        near_shares: wp.vec4,
+        far: wp.vec4i,
+        far_shares: wp.vec4,
     ) -> vec:
-        """The sum of four samples of one shell and four of the next."""
+        """The sum of four samples of a shell and four of the next; `minimum` and `step` are those of the field."""
 
     @wp.func
     def nearest_four(first: int, resolution: int, theta: float, phi: float):
@@ -187,27 +198,43 @@ def make_fields(order: int) -> SimpleNamespace:
             r_1 = r_0 + 1.0
             weight = (1.0 - (r_0 * r_0) / (clamped * clamped)) / (1.0 - (r_0 * r_0) / (r_1 * r_1))
         if inner == wp.static(FIRST_OUTER_SHELL):
-            constant = (
-                near_shares[0] * table.samples[near[0]][0]
-                + near_shares[1] * table.samples[near[1]][0]
-                + near_shares[2] * table.samples[near[2]][0]
-                + near_shares[3] * table.samples[near[3]][0]
+            constant = table.minimum[field, inner][0] + table.step[field, inner][0] * (
+                near_shares[0] * float(table.codes[near[0]][0])
+                + near_shares[1] * float(table.codes[near[1]][0])
+                + near_shares[2] * float(table.codes[near[2]][0])
+                + near_shares[3] * float(table.codes[near[3]][0])
             )
             share = wp.clamp(wp.static(HEMISPHERE_SHARE) * constant, 0.0, 1.0)
             weight = wp.pow(weight, 1.0 - wp.static(CONTACT_POWER) * share)
         beyond = last / wp.max(radius, last)
         scale = beyond * beyond
-        return blend(table.samples, near, (scale * (1.0 - weight)) * near_shares, far, (scale * weight) * far_shares)
+        return blend(
+            table.codes,
+            table.minimum[field],
+            table.step[field],
+            inner,
+            near,
+            (scale * (1.0 - weight)) * near_shares,
+            far,
+            (scale * weight) * far_shares,
+        )
 
-    return SimpleNamespace(FieldTable=FieldTable, lookup_coverage=lookup_coverage, vec=vec)
+    return SimpleNamespace(FieldTable=FieldTable, lookup_coverage=lookup_coverage, vec=vec, code=code)
 
 
 def _blend_snippet(order: int) -> str:
     """C++ that reads the eight samples and sums them in one pass."""
-    terms = [f"{shell}_shares[{k}] * samples.data[{shell}[{k}]][i]" for shell in ("near", "far") for k in range(4)]
+    sums = {
+        shell: " + ".join(f"{shell}_shares[{k}] * (float)codes.data[{shell}[{k}]][i]" for k in range(4))
+        for shell in ("near", "far")
+    }
     return f"""
+    const float near_total = near_shares[0] + near_shares[1] + near_shares[2] + near_shares[3];
+    const float far_total = far_shares[0] + far_shares[1] + far_shares[2] + far_shares[3];
     wp::vec_t<{order * order}, float> sum;
-    for (int i = 0; i < {order * order}; ++i) sum[i] = {" + ".join(terms)};
+    for (int i = 0; i < {order * order}; ++i)
+        sum[i] = near_total * minimum.data[shell][i] + step.data[shell][i] * ({sums["near"]})
+            + far_total * minimum.data[shell + 1][i] + step.data[shell + 1][i] * ({sums["far"]});
     return sum;
     """
 
@@ -222,8 +249,12 @@ def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):
         [start + np.cumsum(count) - count for start, count in zip(first, counts, strict=True)], np.int32
     ).reshape(-1, SHELL_COUNT)
     coefficients = sh.coefficient_count(order)
-    samples = np.concatenate([field.dequantised() for field in fields] or [np.zeros((0, coefficients), np.float32)])
-    table.samples = wp.array(samples, dtype=kit.vec, device=device)
+    codes = np.concatenate([np.zeros((0, coefficients), np.uint8), *(field.codes for field in fields)])
+    table.codes = wp.array(codes, dtype=kit.code, device=device)
+    minimum = np.array([field.minimum for field in fields], np.float32).reshape(-1, SHELL_COUNT, coefficients)
+    table.minimum = wp.array(minimum, dtype=kit.vec, ndim=2, device=device)
+    steps = np.array([field.step for field in fields], np.float32).reshape(-1, SHELL_COUNT, coefficients)
+    table.step = wp.array(steps, dtype=kit.vec, ndim=2, device=device)
     table.shell_first = wp.array(shell_first, dtype=wp.int32, ndim=2, device=device)
     resolutions = np.array([field.resolutions for field in fields], np.int32).reshape(-1, SHELL_COUNT)
     table.shell_resolution = wp.array(resolutions, dtype=wp.int32, ndim=2, device=device)
