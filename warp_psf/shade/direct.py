@@ -47,22 +47,139 @@ def make_direct(order: int) -> SimpleNamespace:
         first_transfer: wp.array(dtype=wp.int32)  # (entity): -1 for convex bodies
         lobe: wp.array(dtype=profile)  # (entity): Phong lobe, coefficients of Legendre polynomials
 
-    @wp.func
-    def mirror(eye: wp.vec3, p: wp.vec3, n: wp.vec3) -> wp.vec3:
-        """The direction from which a mirror at p would send light to the eye."""
-        view = wp.normalize(eye - p)
-        return 2.0 * wp.dot(n, view) * n - view
+    @wp.struct
+    class Surface:
+        """A receiver with what shading it needs to know of the surface it lies on."""
+
+        entity: wp.int32
+        position: wp.vec3
+        normal: wp.vec3
+        mirrored: wp.vec3  # where a mirror there would send the eye's rays
+        first_transfer: wp.int32  # of the entity's stored transfer; -1 where the closed form holds
+        corners: wp.vec3i  # of the face
+        uv: wp.vec2  # weights of the first two corners
 
     @wp.func
-    def interpolate(
-        stored: wp.array(dtype=vec), start: int, corners: wp.vec3i, uv: wp.vec2, rows: wp.array(dtype=half_values)
-    ) -> values:
+    def surface_of(
+        world: int,
+        receiver: int,
+        receivers: ReceiverTable,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        lighting: Lighting,
+    ) -> Surface:
+        surface = Surface()
+        entity = receivers.entity[world, receiver]
+        mesh = geometry.entity_mesh[entity]
+        surface.entity = entity
+        surface.position = receivers.position[world, receiver]
+        surface.normal = receivers.normal[world, receiver]
+        surface.corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, receiver]]
+        surface.uv = receivers.uv[world, receiver]
+        surface.first_transfer = lighting.first_transfer[entity]
+        if surface.first_transfer >= 0:
+            vertex = geometry.first_vertex[mesh]
+            outward = poses.rotation[world, entity] * (
+                surface.uv[0] * geometry.normals[vertex + surface.corners[0]]
+                + surface.uv[1] * geometry.normals[vertex + surface.corners[1]]
+                + (1.0 - surface.uv[0] - surface.uv[1]) * geometry.normals[vertex + surface.corners[2]]
+            )
+            if wp.dot(outward, surface.normal) < 0.0:
+                surface.first_transfer = -1  # the back of an open surface: what is stored is of its front
+        view = wp.normalize(lighting.eye[world] - surface.position)
+        surface.mirrored = 2.0 * wp.dot(surface.normal, view) * surface.normal - view
+        return surface
+
+    @wp.func
+    def interpolate(stored: wp.array(dtype=vec), surface: Surface, rows: wp.array(dtype=half_values)) -> values:
+        """A vector stored per vertex, at the surface and at the directions."""
+        start = surface.first_transfer
         return kit.at_directions(
-            uv[0] * stored[start + corners[0]]
-            + uv[1] * stored[start + corners[1]]
-            + (1.0 - uv[0] - uv[1]) * stored[start + corners[2]],
+            surface.uv[0] * stored[start + surface.corners[0]]
+            + surface.uv[1] * stored[start + surface.corners[1]]
+            + (1.0 - surface.uv[0] - surface.uv[1]) * stored[start + surface.corners[2]],
             rows,
         )
+
+    @wp.func
+    def transfer_of(surface: Surface, rows: wp.array(dtype=half_values), lighting: Lighting, o: Occlusion) -> values:
+        """The clamped cosine, times what the body leaves of its own hemisphere."""
+        if surface.first_transfer >= 0:
+            return interpolate(lighting.transfer, surface, rows)
+        return kit.zonal_at_directions(wp.static(cosine_profile), surface.normal, o.quadrature)
+
+    @wp.func
+    def environment_light(world: int, received: values, lighting: Lighting) -> wp.vec3:
+        return wp.vec3(
+            kit.sum_of_products(lighting.environment[world, 0], received),
+            kit.sum_of_products(lighting.environment[world, 1], received),
+            kit.sum_of_products(lighting.environment[world, 2], received),
+        )
+
+    @wp.func
+    def facing_of(world: int, light: int, poses: PoseTable, lighting: Lighting) -> wp.vec3:
+        """The side to which a flat light shines, in the world; zero for others, and for a light that is not there."""
+        if light >= lighting.light_entity.shape[0]:
+            return wp.vec3()
+        return poses.rotation[world, lighting.light_entity[light]] * lighting.light_facing[light]
+
+    @wp.func
+    def area_light(
+        world: int,
+        light: int,
+        surface: Surface,
+        before: values,
+        lobe: values,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+        lighting: Lighting,
+    ):
+        """Irradiance and radiance through the Phong lobe of one area light, past `before`: what stands before it.
+
+        What the light sends unhindered, times the share of it that is visible.
+        """
+        entity = lighting.light_entity[light]
+        p = surface.position
+        n = surface.normal
+        rotation = poses.rotation[world, entity]
+        position = poses.position[world, entity]
+        radius = geometry.radius[entity]
+        center = position + rotation * geometry.center[entity]
+        facing = facing_of(world, light, poses, lighting)
+        diffuse = float(0.0)
+        glossy = float(0.0)
+        hidden = wp.dot(n, center - p) <= -radius or entity == surface.entity
+        if wp.length_sq(facing) > 0.0:
+            hidden = hidden or wp.dot(facing, p - center) <= 0.0
+        if not hidden:
+            seen = kit.coverage_of(
+                entity,
+                p,
+                position,
+                rotation,
+                geometry.center[entity],
+                radius,
+                o.occluders,
+                o.fields,
+                o.rows[world, entity],
+                o.quadrature,
+            )
+            weighted = wp.cw_mul(seen, lighting.weights[0])
+            whole = wp.max(kit.sum_of_products(weighted, values(1.0)), 1.0e-9)
+            share = wp.clamp(kit.sum_of_products(weighted, before) / whole, 0.0, 1.0)
+            diffuse = area.area_irradiance(entity, p, n, position, rotation, center, radius, o.occluders)
+            if diffuse < 0.0:
+                cosine = kit.zonal_at_directions(wp.static(cosine_profile), n, o.quadrature)
+                diffuse = wp.max(kit.sum_of_products(weighted, cosine), 0.0)
+            diffuse *= share
+            if wp.max(geometry.specular[surface.entity]) > 0.0:
+                exponent = geometry.exponent[surface.entity]
+                glossy = area.area_gloss(entity, p, n, surface.mirrored, exponent, position, rotation, o.occluders)
+                if glossy < 0.0:
+                    glossy = wp.max(kit.sum_of_products(weighted, lobe), 0.0)
+                glossy *= share
+        return diffuse, glossy
 
     @wp.kernel(module="unique")
     def shade_receivers(
@@ -82,112 +199,46 @@ def make_direct(order: int) -> SimpleNamespace:
         entity = receivers.entity[world, receiver]
         if entity < 0 or turns[world, receiver] != turn:
             return
-        p = receivers.position[world, receiver]
-        n = receivers.normal[world, receiver]
+        surface = surface_of(world, receiver, receivers, geometry, poses, lighting)
+        p = surface.position
+        n = surface.normal
         rows = o.rows[world, entity]
-        start = int(lighting.first_transfer[entity])
-        mesh = geometry.entity_mesh[entity]
-        corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, receiver]]
-        uv = receivers.uv[world, receiver]
-        transfer = values()
-        if start >= 0:
-            first_vertex = geometry.first_vertex[mesh]
-            outward = poses.rotation[world, entity] * (
-                uv[0] * geometry.normals[first_vertex + corners[0]]
-                + uv[1] * geometry.normals[first_vertex + corners[1]]
-                + (1.0 - uv[0] - uv[1]) * geometry.normals[first_vertex + corners[2]]
-            )
-            if wp.dot(outward, n) < 0.0:
-                start = -1  # the back of an open surface: what is stored is of its front
-        if start >= 0:
-            transfer = interpolate(lighting.transfer, start, corners, uv, rows)
-        else:
-            transfer = kit.zonal_at_directions(wp.static(cosine_profile), n, o.quadrature)
-
-        glossy = wp.max(geometry.specular[entity]) > 0.0
-        lobe = values()
-        if glossy:
-            mirrored = mirror(lighting.eye[world], p, n)
-            lobe = kit.zonal_at_directions(lighting.lobe[entity], mirrored, o.quadrature)
-            # The transfer brings the cosine that the lobe is normalised for, and what the body hides from itself.
-            lobe = wp.cw_mul(lobe, transfer)
+        transfer = transfer_of(surface, rows, lighting, o)
 
         lights = lighting.light_entity.shape[0]
-        first_light = int(-1)
-        facing = wp.vec3()
+        shining = int(-1)
         if lights > 0:
-            first_light = lighting.light_entity[0]
-            facing = poses.rotation[world, first_light] * lighting.light_facing[0]
-        visible, before = kit.visibility_at(world, entity, first_light, facing, p, n, geometry, poses, o)
-        received = wp.cw_mul(visible, transfer)
-        diffuse = wp.vec3(
-            kit.sum_of_products(lighting.environment[world, 0], received),
-            kit.sum_of_products(lighting.environment[world, 1], received),
-            kit.sum_of_products(lighting.environment[world, 2], received),
-        )
-        reflected = wp.vec3()
-        if glossy:
-            received = wp.cw_mul(visible, lobe)
-            reflected = wp.vec3(
-                kit.sum_of_products(lighting.environment[world, 0], received),
-                kit.sum_of_products(lighting.environment[world, 1], received),
-                kit.sum_of_products(lighting.environment[world, 2], received),
-            )
+            shining = lighting.light_entity[0]
+        facing = facing_of(world, 0, poses, lighting)
+        visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
+        diffuse = environment_light(world, wp.cw_mul(visible, transfer), lighting)
+        glossy = wp.vec3()
+        lobe = values()
+        if wp.max(geometry.specular[entity]) > 0.0:
+            # The transfer brings the cosine that the lobe is normalised for, and what the body hides from itself.
+            lobe = kit.zonal_at_directions(lighting.lobe[entity], surface.mirrored, o.quadrature)
+            lobe = wp.cw_mul(lobe, transfer)
+            glossy = environment_light(world, wp.cw_mul(visible, lobe), lighting)
 
         open_to_self = values(1.0)
-        if start >= 0 and lights > 0:
+        if surface.first_transfer >= 0 and lights > 0:
             # 1 minus what the body itself blocks above the horizon.
-            open_to_self += interpolate(lighting.self_visibility, start, corners, uv, rows)
+            open_to_self += interpolate(lighting.self_visibility, surface, rows)
             open_to_self -= kit.cap_coverage(n, 0.0, o.quadrature)
         for light in range(lights):
-            shining = lighting.light_entity[light]
-            rotation = poses.rotation[world, shining]
-            position = poses.position[world, shining]
-            radius = geometry.radius[shining]
-            center = position + rotation * geometry.center[shining]
-            facing = rotation * lighting.light_facing[light]
-            lit = wp.dot(n, center - p) > -radius and shining != entity
-            if wp.length_sq(facing) > 0.0:
-                lit = lit and wp.dot(facing, p - center) > 0.0
-            if lit:
-                if light > 0:
-                    _all, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
-                seen = kit.coverage_of(
-                    shining,
-                    p,
-                    position,
-                    rotation,
-                    geometry.center[shining],
-                    radius,
-                    o.occluders,
-                    o.fields,
-                    o.rows[world, shining],
-                    o.quadrature,
-                )
-                weighted = wp.cw_mul(seen, lighting.weights[0])
-                passed = kit.sum_of_products(weighted, wp.cw_mul(before, open_to_self))
-                share = wp.clamp(passed / wp.max(kit.sum_of_products(weighted, values(1.0)), 1.0e-9), 0.0, 1.0)
-                unhindered = area.area_irradiance(shining, p, n, position, rotation, center, radius, o.occluders)
-                if unhindered < 0.0:
-                    unhindered = wp.max(
-                        kit.sum_of_products(
-                            weighted, kit.zonal_at_directions(wp.static(cosine_profile), n, o.quadrature)
-                        ),
-                        0.0,
-                    )
-                radiance = share * lighting.light_radiance[world, light]
-                diffuse += unhindered * radiance
-                if glossy:
-                    mirrored = mirror(lighting.eye[world], p, n)
-                    exponent = geometry.exponent[entity]
-                    shine = area.area_gloss(shining, p, n, mirrored, exponent, position, rotation, o.occluders)
-                    if shine < 0.0:
-                        shine = wp.max(kit.sum_of_products(weighted, lobe), 0.0)
-                    reflected += shine * radiance
+            if light > 0:
+                shining = lighting.light_entity[light]
+                facing = facing_of(world, light, poses, lighting)
+                _visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
+            passed = wp.cw_mul(before, open_to_self)
+            irradiance, gloss = area_light(world, light, surface, passed, lobe, geometry, poses, o, lighting)
+            diffuse += irradiance * lighting.light_radiance[world, light]
+            glossy += gloss * lighting.light_radiance[world, light]
 
+        # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
         zero = wp.vec3()
         diffuse_out[world, receiver] = wp.max(diffuse, zero)
-        glossy_out[world, receiver] = wp.max(reflected, zero)
+        glossy_out[world, receiver] = wp.max(glossy, zero)
 
     return SimpleNamespace(**vars(kit), Lighting=Lighting, shade_receivers=shade_receivers)
 
