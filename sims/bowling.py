@@ -73,14 +73,14 @@ def lights() -> tuple:
 
     return (
         psf.rectangle_light(
-            "soft box", 1.5, 1.5, radiance=(36.0, 34.0, 31.0), position=(-3.0, 2.7, 2.9), target=(0.3, 0.0, 0.1)
+            "soft box", 1.5, 1.5, radiance=(52.0, 49.0, 44.5), position=(-3.0, 2.7, 2.9), target=(0.3, 0.0, 0.1)
         ),
     )
 
 
 def environment() -> psf.Environment:
     """Fills the shadows: on the lane, about half of what the soft box gives."""
-    return dimmed("studio", 0.33, turn=-math.pi / 2)
+    return dimmed("studio", 0.42, turn=-math.pi / 2)
 
 
 def _add_lane(spec: mujoco.MjSpec) -> None:

@@ -115,14 +115,14 @@ def lights() -> tuple:
 
     return (
         psf.rectangle_light(
-            "window", 1.2, 1.2, radiance=(26.0, 24.8, 23.0), position=(-2.6, -0.8, 2.3), target=(0.0, 0.0, 0.1)
+            "window", 1.2, 1.2, radiance=(34.0, 32.4, 30.0), position=(-2.6, -0.8, 2.3), target=(0.0, 0.0, 0.1)
         ),
     )
 
 
 def environment() -> psf.Environment:
     """Fills the shadows: on the floor, about half of what the window gives."""
-    return dimmed("studio", 0.33)
+    return dimmed("studio", 0.4)
 
 
 def _shapes(spec: mujoco.MjSpec) -> dict[str, list[dict]]:
