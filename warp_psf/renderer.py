@@ -16,6 +16,7 @@ from warp_psf.device import find_device
 from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
 from warp_psf.film.primary import aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import make_film, read_layers, resolve_pixels
+from warp_psf.scene.detail import refine_flat_bodies
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.geometry import upload_scene, write_poses
 from warp_psf.scene.light import Light, area_light_entities
@@ -47,7 +48,8 @@ class Renderer:
         HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
     lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
     order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
-    shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates.
+    shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
+        planes are cut finely enough for that; other meshes show what their vertices resolve.
     material_space: whether MJCF's rgba is "srgb" or "linear".
     model_lights: False leaves out the model's own lights and headlight.
     exposure, view: how `render` develops the picture: stops, and a view transform, "neutral" or "srgb".
@@ -84,6 +86,8 @@ class Renderer:
         self._device = find_device(device)
         self._environment = load_environment(environment)
         self._scene = build_scene(model, material_space=material_space, lights=lights, model_lights=model_lights)
+        if shading == "vertex":
+            self._scene = refine_flat_bodies(self._scene)
         self._upload(self._bake(progress or (lambda what, share: None)))
         self._depth_rendering = self._segmentation_rendering = False
         self._world_from_camera: np.ndarray | None = None
