@@ -1,5 +1,6 @@
 """Bad input gets one sentence that names the thing; unusual input is rendered."""
 
+import pickle
 import re
 
 import mujoco
@@ -119,6 +120,39 @@ def test_bad_meshes(vertices, faces, words):
 def test_light_on_a_body_that_is_not_there(model):
     light = psf.rectangle_light("lamp", 1, 1, (1, 1, 1), (0, 0, 1), body="arm")
     assert_refused(lambda: psf.Renderer(model, 4, 4, lights=[light]), ValueError, "'lamp'", "'arm'", "world")
+
+
+@pytest.mark.parametrize(
+    ("lights", "error", "words"),
+    [
+        (psf.rectangle_light("lamp", 1, 1, (1, 1, 1), (0, 0, 1)), TypeError, ("lights", "AreaLight", "list")),
+        (None, TypeError, ("lights", "NoneType", "list")),
+        (["lamp"], TypeError, ("lights", "str", "AreaLight")),
+        ([psf.DeltaLight("lamp", "point", *np.ones((5, 3)), index=9)], ValueError, ("'lamp'", "light 9", "has 0")),
+    ],
+)
+def test_lights_that_are_none(model, lights, error, words):
+    assert_refused(lambda: psf.Renderer(model, 4, 4, lights=lights), error, *words)
+
+
+def test_an_area_light_without_a_mesh():
+    assert_refused(lambda: psf.AreaLight("lamp", None, (1, 1, 1)), TypeError, "'lamp'", "NoneType", "make_mesh")
+
+
+@pytest.mark.parametrize("part", ["cutoff", "exponent", "radius"])
+def test_delta_lights_without_bounds(part):
+    assert_refused(
+        lambda: psf.DeltaLight("lamp", "spot", *np.ones((5, 3)), **{part: np.inf}), ValueError, "'lamp'", part, "inf"
+    )
+
+
+def test_data_that_is_none(model):
+    renderer = psf.Renderer(model, 4, 4)
+    assert_refused(lambda: renderer.update_scene(None), TypeError, "data is a NoneType", "mujoco.MjData")
+
+
+def test_renderers_are_not_pickled(model):
+    assert_refused(lambda: pickle.dumps(psf.Renderer(model, 4, 4)), TypeError, "Renderer", "each process")
 
 
 def test_data_of_another_model_leaves_the_state_alone():

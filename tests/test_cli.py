@@ -176,6 +176,7 @@ def test_other_settings_are_not_mixed_into_a_folder(renderers, model_path, tmp_p
         (("--fps", "0"), ("--fps",)),
         (("--duration", "nan"), ("--duration",)),
         (("--duration", "-1"), ("--duration",)),
+        (("--duration", "1e308"), ("frame 1000000", "--duration")),
         (("--formats", "exr,gif"), ("gif", "exr, png, mp4")),
         (("--formats", ""), ("formats",)),
         (("--view", "rosy"), ("rosy",)),

@@ -299,3 +299,30 @@ def test_inside_of_an_open_bowl_is_lit_from_above(monkeypatch):
         middle[camera] = renderer.layers()["direct"][4, 4, 0]
     # The sky is brightest above and dark below.
     assert middle["above"] > 2 * middle["below"] > 0
+
+
+# Lights in awkward places
+
+
+@pytest.mark.parametrize("shading", ["pixel", "vertex"])
+def test_a_panel_that_stands_on_the_floor_lights_it(shading):
+    # The panel's lower edge lies exactly in the floor's plane: corners at height zero must close its polygon too.
+    camera = '<camera name="front" pos="0 0 4" xyaxes="1 0 0 0 1 0"/>'
+    floor = '<geom name="floor" type="box" size="2 2 .1" pos="0 0 -.1"/>'
+    mean = {}
+    for height in (0.5, 0.5 + 1e-4):
+        lifted = psf.rectangle_light("panel", 1, 1, (1, 1, 1), (0, 2, height), (0, 0, height))
+        renderer, data = make_renderer(floor + camera, 32, 32, environment=None, lights=[lifted], shading=shading)
+        renderer.update_scene(data, "front")
+        mean[height] = renderer.layers()["direct"].mean()
+    # A ten-thousandth of a metre changes the light by about as much.
+    assert mean[0.5] == pytest.approx(mean[0.5 + 1e-4], rel=1e-2)
+    assert mean[0.5] > 0
+
+
+def test_a_tiny_lamp_keeps_its_light():
+    # The coverage of small caps must keep its digits, or an empty floor would count as shadowed: 4 mm at 10 m.
+    kit = [psf.AreaLight("lamp", primitives.sphere(0.004), (1e4,) * 3, (0, 0, 10))]
+    renderer, _ = make_renderer(FLOOR, environment=None, lights=kit)
+    found = shade_points(renderer, "floor", np.zeros((1, 3)), UP)[0][0, 0]
+    assert found == pytest.approx(np.pi * 1e4 * (0.004 / 10) ** 2, rel=1e-3)

@@ -220,3 +220,18 @@ def test_edges_blend_with_the_background():
     outside = 1 - weights_of(renderer).reshape(HEIGHT, WIDTH)
     np.testing.assert_allclose(layers["color"] - layers["direct"], 2 * outside[..., None] * np.ones(3), atol=1e-5)
     assert ((outside > 0.1) & (outside < 0.9)).sum() > 30
+
+
+def test_a_telephoto_view_loses_no_pixels():
+    # Angles of a hundredth of a degree: acos has no digits for them in float32.
+    xml = (
+        '<geom type="sphere" size=".01" pos="0 0 0"/><camera name="far" pos="0 -20 0" xyaxes="1 0 0 0 0 1" fovy=".1"/>'
+    )
+    renderer, data = make_renderer(
+        '<geom type="sphere" size=".01"/>' + camera, 90, 90, header="<visual><quality offsamples='0'/></visual>"
+    )
+    renderer.update_scene(data, "far")
+    seen = (renderer.layers()["segmentation"][..., 0] >= 0).sum()
+    radius = 45 * (0.01 / 20) / np.tan(np.deg2rad(0.05))
+    # The disc's area in pixels, but for its jagged rim.
+    assert seen == pytest.approx(np.pi * radius**2, abs=2 * np.pi * radius * 0.5)

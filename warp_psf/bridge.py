@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_psf.scene import primitives
 from warp_psf.scene.camera import Camera
-from warp_psf.scene.light import AreaLight, DeltaLight, Light, area_light_entities
+from warp_psf.scene.light import AreaLight, DeltaLight, Light, area_light_entities, check_lights
 from warp_psf.scene.material import Material
 from warp_psf.scene.mesh import Mesh, make_mesh
 from warp_psf.scene.scene import Entity, Poses, Scene
@@ -111,10 +111,12 @@ def build_scene(
         The scene; its lights are the area lights of `lights` first, then the others, then the model's, headlight last.
 
     Raises:
-        ValueError: `material_space` is unknown, or a light hangs on a body that the model lacks.
+        ValueError: `material_space` is unknown, or a light hangs on a body, or follows a light, that the model lacks.
+        TypeError: `lights` is not a list of lights.
     """
     if material_space not in ("srgb", "linear"):
         raise ValueError(f"material_space is {material_space!r}; choose 'srgb' or 'linear'")
+    check_lights(lights, model.nlight)
     undrawn = _undrawn(model)
     if undrawn:
         warnings.warn(f"not drawn, because not supported yet: {', '.join(undrawn)}", stacklevel=2)
@@ -214,7 +216,9 @@ def read_camera(model: mujoco.MjModel, data: mujoco.MjData, camera: int | str | 
 
 
 def check_data(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Raises ValueError unless `data` was made for `model`."""
+    """Raises ValueError unless `data` was made for `model`, TypeError unless it is MuJoCo's."""
+    if not isinstance(data, mujoco.MjData):
+        raise TypeError(f"data is a {type(data).__name__}; give the mujoco.MjData of the model")
     sizes = {
         "nq": (model.nq, len(data.qpos)),
         "nv": (model.nv, len(data.qvel)),

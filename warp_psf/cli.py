@@ -356,7 +356,8 @@ def parse_frames(text: str | None, frames_per_second: int, duration: float) -> r
         raise ValueError(f"--fps {frames_per_second} must be at least 1")
     if not (math.isfinite(duration) and duration > 0.0):
         raise ValueError(f"--duration {duration} must be a positive number of seconds")
-    count = max(1, round(frames_per_second * duration))
+    # Cut to one frame too many, which is refused below: a product beyond the largest float has no integer.
+    count = max(1, round(min(frames_per_second * duration, MOST_FRAMES + 1)))
     match = re.fullmatch(r"(\d*):(\d*)", text or ":")
     if not match:
         raise ValueError(f"--frames {text} is not a range such as 0:120")

@@ -74,12 +74,17 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=core_count(), thread_name_prefix="warp_psf")
 
 
+if hasattr(os, "register_at_fork"):
+    # A forked process has none of its parent's threads, so it must not wait for them.
+    os.register_at_fork(after_in_child=_workers.cache_clear)
+
+
 @cache
 def _quiet_start() -> None:
-    # Warp's banner, its compilation notes and its wish for a CUDA driver are not this library's output.
-    wp.config.log_level = wp.LOG_ERROR
-    # Compiling the adjoint of every kernel doubles the first run's wait; who differentiates a kernel turns it on.
-    wp.config.enable_backward = False
+    # Warp's banner, its compilation notes and its wish for a CUDA driver are not this library's output. Who chose a
+    # level keeps it.
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
     with _without_driver_warning():
         wp.init()
 

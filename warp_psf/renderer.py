@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NoReturn
 
 import mujoco
 import numpy as np
@@ -42,14 +43,15 @@ class Renderer:
             renderer.update_scene(data, camera="front")
             rgb = renderer.render()
 
-    model: the compiled model; edges are antialiased unless its `visual/quality` says offsamples = 0. height, width: of
-        the picture, pixels.
+    model: the compiled model; edges are antialiased unless its `visual/quality` says offsamples below 2. height, width:
+        of the picture, pixels.
     environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
         HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
     lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
     order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
     shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
-        planes are cut finely enough for that; other meshes show what their vertices resolve.
+        planes are cut finely enough for that; other meshes show what their vertices resolve, and open ones the light of
+        their front on both sides.
     material_space: whether MJCF's rgba is "srgb" or "linear".
     model_lights: False leaves out the model's own lights and headlight.
     exposure, view: how `render` develops the picture: stops, and a view transform, "neutral" or "srgb".
@@ -58,6 +60,7 @@ class Renderer:
 
     Raises:
         ValueError: a size, order, name or device is not usable; the message says which and what is.
+        TypeError: the model, the environment or a light is of another type.
         FileNotFoundError: the environment's file does not exist.
     """
 
@@ -163,11 +166,11 @@ class Renderer:
         """
         self._draw()
         if self._depth_rendering:
-            depth = read_layers(self._film)["depth"]
+            depth = read_layers(self._film, ("depth",))["depth"]
             far = self._model.vis.map.zfar * self._model.stat.extent
             picture = np.minimum(depth, np.float32(far))
         elif self._segmentation_rendering:
-            picture = read_layers(self._film)["segmentation"]
+            picture = read_layers(self._film, ("segmentation",))["segmentation"]
         else:
             with self._timed("display"):
                 color = self._film.layers.color.numpy()[0].reshape(self._height, self._width, 3)
@@ -222,6 +225,9 @@ class Renderer:
 
     def __exit__(self, kind, error, trace) -> None:
         self.close()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("a Renderer cannot be pickled or copied; make one in each process that renders")
 
     def _bake(self, progress: Progress) -> list[BakedBody]:
         """Every mesh's baked body; one that only area lights have neither casts nor receives shadows."""

@@ -30,7 +30,7 @@ SURFACE_OFFSET = 1.0e-4
 # Layers of surface that a ray out of the solid crosses before it gives up.
 MOST_LAYERS = 32
 # A vector is rotated through its values at a quadrature's directions: exact for twice the highest degree.
-ROTATION_POINTS = {2: 16, 3: 16, 4: 32, 5: 64, 6: 64}
+ROTATION_POINTS = {2: 16, 3: 16, 4: 32, 5: 32, 6: 64}
 
 
 @cache
@@ -53,7 +53,7 @@ def make_visibility(order: int) -> SimpleNamespace:
             turned += wp.dot(local, kit.evaluate(to_local * directions[q])) * weighted_basis[q]
         return turned
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def project_coverage(
         first: int,
         mesh: wp.uint64,
@@ -75,7 +75,7 @@ def make_visibility(order: int) -> SimpleNamespace:
                 covered += weighted_basis[ray]
         coverage_out[sample] = turn(covered, frame, directions, direction_basis)
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def project_radiance(
         first: int,
         mesh: wp.uint64,
@@ -99,7 +99,7 @@ def make_visibility(order: int) -> SimpleNamespace:
                 gathered += face_radiance[hit.face] * weighted_basis[ray]
         radiance_out[sample] = turn(gathered, frame, directions, direction_basis)
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def project_blocked_hemisphere(
         first: int,
         mesh: wp.uint64,
@@ -155,7 +155,7 @@ def is_inside(
     return float(leaving) >= least_share * float(rays.shape[0])
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _leave_solid(
     first: int,
     mesh: wp.uint64,

@@ -19,7 +19,7 @@ import numpy as np
 
 _MAGIC = b"WPSFv1\n\0"
 _DIGEST_BYTES = 32
-# Larger than any field this library writes (2 MB each, transfers of a million vertices 300 MB).
+# Larger than any field this library writes (at most 5 MB each, transfers of a million vertices 300 MB).
 _MOST_BYTES = 2**30
 
 
@@ -47,6 +47,8 @@ def save_arrays(key: str, arrays: dict[str, np.ndarray]) -> None:
     payload = io.BytesIO()
     np.savez(payload, **arrays)
     content = payload.getvalue()
+    if len(_MAGIC) + _DIGEST_BYTES + len(content) > _MOST_BYTES:
+        return  # it would be refused when read
     folder = cache_folder()
     temporary = None
     try:

@@ -19,12 +19,14 @@ from warp_psf.scene.camera import Camera
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, may_hit
 from warp_psf.scene.receiver import ReceiverTable, make_receivers
 
+# Angles are taken this much wider than they come out in float32, so that no body is lost at the rim of a tile.
+TILE_MARGIN = 1.001
 # Pixels along the side of a tile; rays only meet the entities whose bounding spheres reach into their tile's cone.
 TILE = 16
 SAMPLES = 8
 EXTRA_GROUPS = 3
 # Neighbouring pixels lie on one smooth surface when their normals differ by less than acos(0.9), about 26 degrees,
-# and their depths by less than this share plus what the surface's tilt explains.
+# and one lies off the other's tangent plane by less than this share of the depth plus half their distance.
 SAME_NORMAL = wp.constant(0.9)
 SAME_DEPTH = wp.constant(0.02)
 # Room for edge pixels, as a share of all; further edges of a picture that is nearly all edge stay aliased.
@@ -33,6 +35,8 @@ EDGE_SHARE = 1.0 / 3.0
 
 @wp.struct
 class CameraTable:
+    """The film's camera in every world."""
+
     position: wp.array(dtype=wp.vec3)  # (world), metres
     rotation: wp.array(dtype=wp.mat33)  # (world), world_from_camera
     tangent: wp.array(dtype=wp.float32)  # (world): tan(fovy / 2)
@@ -52,6 +56,8 @@ class TileTable:
 
 @wp.struct
 class Hit:
+    """What a camera ray meets; entity -1 is nothing."""
+
     entity: wp.int32
     face: wp.int32
     u: wp.float32
@@ -95,7 +101,13 @@ def camera_ray(camera: CameraTable, world: int, x: float, y: float) -> wp.vec3:
     return camera.rotation[world] * wp.vec3(right, up, -1.0)
 
 
-@wp.kernel(module="unique")
+@wp.func
+def angle_between(a: wp.vec3, b: wp.vec3) -> float:
+    """The angle between two vectors, which keeps its digits where acos has none left."""
+    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
+
+
+@wp.kernel(enable_backward=False, module="unique")
 def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, tiles: TileTable):
     world, tile = wp.tid()
     tile += first
@@ -103,12 +115,11 @@ def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: C
     x = float(tile % tiles.columns) * size
     y = float(tile / tiles.columns) * size
     axis = wp.normalize(camera_ray(camera, world, x + 0.5 * size, y + 0.5 * size))
-    widest = float(1.0)
+    half_angle = float(0.0)
     for corner in range(4):
         ray = camera_ray(camera, world, x + size * float(corner % 2), y + size * float(corner / 2))
-        widest = wp.min(widest, wp.dot(axis, wp.normalize(ray)))
-    # A hundredth wider, for acos near 1 has few digits.
-    half_angle = 1.01 * wp.acos(widest) + 1.0e-4
+        half_angle = wp.max(half_angle, angle_between(axis, ray))
+    half_angle = wp.static(TILE_MARGIN) * half_angle
     count = int(0)
     for entity in range(geometry.entity_mesh.shape[0]):
         center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
@@ -117,8 +128,7 @@ def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: C
         radius = geometry.radius[entity]
         seen = distance <= radius
         if not seen:
-            apart = wp.acos(wp.clamp(wp.dot(offset, axis) / distance, -1.0, 1.0))
-            seen = apart < half_angle + wp.asin(radius / distance)
+            seen = angle_between(axis, offset) < half_angle + wp.static(TILE_MARGIN) * wp.asin(radius / distance)
         if seen:
             gap = distance - radius
             place = count
@@ -134,6 +144,7 @@ def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: C
 
 @wp.func
 def tile_of(tiles: TileTable, pixel: int, width: int) -> int:
+    """The tile that a pixel lies in."""
     return (pixel / width / wp.static(TILE)) * tiles.columns + (pixel % width) / wp.static(TILE)
 
 
@@ -160,7 +171,8 @@ def trace(
         along = wp.dot(to_center, direction)
         radius = geometry.radius[entity]
         # Discriminant of the ray against the bounding sphere, and whether the sphere lies ahead and near enough.
-        reach = along * along - length_squared * (wp.dot(to_center, to_center) - radius * radius)
+        beside = to_center - (along / length_squared) * direction
+        reach = length_squared * (radius * radius - wp.dot(beside, beside))
         if reach >= 0.0:
             root = wp.sqrt(reach)
             if along + root > 0.0 and along - root < nearest * length_squared:
@@ -200,6 +212,7 @@ def trace(
 
 @wp.func
 def store_hit(receivers: ReceiverTable, world: int, slot: int, hit: Hit, weight: float):
+    """Makes a hit the receiver of a slot, with its share of the pixel."""
     receivers.entity[world, slot] = hit.entity
     receivers.face[world, slot] = hit.face
     receivers.uv[world, slot] = wp.vec2(hit.u, hit.v)
@@ -209,7 +222,7 @@ def store_hit(receivers: ReceiverTable, world: int, slot: int, hit: Hit, weight:
     receivers.weight[world, slot] = weight
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _trace_centers(
     first: int,
     geometry: GeometryTable,
@@ -230,6 +243,7 @@ def _trace_centers(
 
 @wp.func
 def same_surface(receivers: ReceiverTable, world: int, a: int, b: int) -> bool:
+    """Whether two neighbouring pixels lie on one smooth surface."""
     if receivers.entity[world, a] != receivers.entity[world, b]:
         return False
     if receivers.entity[world, a] < 0:
@@ -242,7 +256,7 @@ def same_surface(receivers: ReceiverTable, world: int, a: int, b: int) -> bool:
     return away < SAME_DEPTH * receivers.depth[world, a] + 0.5 * wp.length(offset)
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _find_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge_out: wp.array2d(dtype=wp.int32)):
     world, pixel = wp.tid()
     pixel += first
@@ -260,7 +274,7 @@ def _find_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge_
     edge_out[world, pixel] = wp.where(smooth, 0, 1)
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _trace_edges(
     first: int,
     geometry: GeometryTable,

@@ -71,7 +71,7 @@ def shows_front(receivers: ReceiverTable, world: int, slot: int, geometry: Geome
     return wp.dot(poses.rotation[world, entity] * outward, receivers.normal[world, slot]) > 0.0
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _resolve_pixels(
     first: int,
     geometry: GeometryTable,
@@ -150,11 +150,14 @@ def resolve_pixels(
     launch(_resolve_pixels, surfaces.extra.shape, [*inputs, film.background, film.layers], [], device)
 
 
-def read_layers(film: Film, world: int = 0) -> dict[str, np.ndarray]:
+LAYERS = ("color", "direct", "albedo", "normal", "depth", "segmentation")
+
+
+def read_layers(film: Film, names: tuple[str, ...] = LAYERS, world: int = 0) -> dict[str, np.ndarray]:
     """One world's layers on the host, [height, width, ...]."""
     size = (film.height, film.width)
     layers = {}
-    for name in ("color", "direct", "albedo", "normal", "depth", "segmentation"):
+    for name in names:
         values = getattr(film.layers, name).numpy()[world]
         layers[name] = values.reshape(*size, *values.shape[1:]).copy()
     return layers

@@ -60,7 +60,6 @@ class DeviceScene:
     geometry: GeometryTable
     poses: PoseTable
     meshes: tuple[wp.Mesh, ...]
-    vertex_count: int
 
 
 def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
@@ -103,7 +102,7 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     poses = PoseTable()
     poses.position = wp.zeros((worlds, len(scene.entities)), dtype=wp.vec3, device=device)
     poses.rotation = wp.zeros((worlds, len(scene.entities)), dtype=wp.mat33, device=device)
-    return DeviceScene(table, poses, meshes, sum(len(mesh.vertices) for mesh in scene.meshes))
+    return DeviceScene(table, poses, meshes)
 
 
 def write_poses(device_scene: DeviceScene, poses: Poses) -> None:

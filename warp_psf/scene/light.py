@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -32,6 +33,7 @@ class AreaLight:
 
     Raises:
         ValueError: a value is NaN, negative or of another shape, or `rotation` is not a rotation.
+        TypeError: `mesh` is not a `Mesh`.
     """
 
     name: str
@@ -43,6 +45,8 @@ class AreaLight:
 
     def __post_init__(self) -> None:
         owner = f"light {self.name!r}"
+        if not isinstance(self.mesh, Mesh):
+            raise TypeError(f"{owner}: mesh is a {type(self.mesh).__name__}; give a Mesh, from load_mesh or make_mesh")
         object.__setattr__(self, "radiance", _color(self.radiance, owner, "radiance"))
         object.__setattr__(self, "position", _numbers(self.position, (3,), owner, "position"))
         object.__setattr__(self, "rotation", _rotation(self.rotation, owner))
@@ -76,7 +80,8 @@ class DeltaLight:
         None stays where it is.
 
     Raises:
-        ValueError: a value is NaN, negative or of another shape, or `direction` has no length.
+        ValueError: a value is NaN, negative, infinite (but for `range`) or of another shape, or `direction` has no
+            length.
     """
 
     name: str
@@ -106,6 +111,8 @@ class DeltaLight:
             value = float(getattr(self, part))
             if not value >= 0.0:
                 raise ValueError(f"{owner}: {part} is {value}; give a number of at least 0")
+            if part != "range" and value == np.inf:
+                raise ValueError(f"{owner}: {part} is inf; give a finite number")
             object.__setattr__(self, part, value)
 
 
@@ -148,6 +155,25 @@ def rectangle_light(
     elif rotation is None:
         rotation = np.eye(3)
     return AreaLight(name, plane(width / 2.0, height / 2.0, cells=1), radiance, position, rotation, body)
+
+
+def check_lights(lights: Sequence[Light], model_count: int) -> None:
+    """Checks a list that a user gave; `model_count` lights are in the model.
+
+    Raises:
+        TypeError: it is no list, or holds something else than lights.
+        ValueError: a light's index is not one of the model's.
+    """
+    if not isinstance(lights, Sequence) or isinstance(lights, str):
+        raise TypeError(f"lights is a {type(lights).__name__}; give a list of AreaLight and DeltaLight")
+    for light in lights:
+        if not isinstance(light, (AreaLight, DeltaLight)):
+            raise TypeError(f"lights holds a {type(light).__name__}; give AreaLight and DeltaLight only")
+        if isinstance(light, DeltaLight) and light.index is not None and not -1 <= light.index < model_count:
+            raise ValueError(
+                f"light {light.name!r} follows light {light.index} of the model, which has {model_count}; give an "
+                "index of the model, or None for a light of its own"
+            )
 
 
 def area_light_entities(scene: Scene) -> tuple[tuple[AreaLight, int], ...]:

@@ -11,7 +11,7 @@ class ReceiverTable:
     face: wp.array2d(dtype=wp.int32)  # of the entity's mesh
     uv: wp.array2d(dtype=wp.vec2)  # weights of the face's first two vertices
     position: wp.array2d(dtype=wp.vec3)  # world, metres
-    normal: wp.array2d(dtype=wp.vec3)  # world, unit, towards the viewer's side
+    normal: wp.array2d(dtype=wp.vec3)  # world, unit; a pixel's is turned towards the viewer
     depth: wp.array2d(dtype=wp.float32)  # metres along the optical axis
     weight: wp.array2d(dtype=wp.float32)  # share of its pixel
 

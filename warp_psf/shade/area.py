@@ -56,11 +56,11 @@ def make_area(order: int) -> SimpleNamespace:
                 height_b = wp.dot(n, b)
                 # The part below the horizon is cut off; the arc along the horizon closes the rest.
                 if height_a > 0.0 or height_b > 0.0:
-                    if height_a < 0.0:
+                    if height_a <= 0.0:
                         a = a + (height_a / (height_a - height_b)) * (b - a)
                         returning = wp.normalize(a)
                         crossings += 1
-                    elif height_b < 0.0:
+                    elif height_b <= 0.0:
                         b = a + (height_a / (height_a - height_b)) * (b - a)
                         leaving = wp.normalize(b)
                         crossings += 1

@@ -1,7 +1,7 @@
 """Coverage: which part of the directions around a point an entity takes up, at the directions of a quadrature.
 
 Where coverage has a closed form it is used: spheres (zonal), boxes and rectangles (spherical polygons). The others
-are looked up in their shadow fields. All three give the exact projection on `order` bands, evaluated at the directions.
+are looked up in their shadow fields. All give the projection on `order` bands, evaluated at the directions.
 """
 
 from functools import cache
@@ -40,17 +40,25 @@ def make_coverage(order: int) -> SimpleNamespace:
         slab_half: wp.array(dtype=wp.vec3)  # (entity), half extents, metres
 
     @wp.func
-    def cap_coverage(axis: wp.vec3, x: float, quadrature: wp.array(dtype=half_values)) -> values:
-        """The cap about a unit axis of the directions whose cosine exceeds x = cos(half-angle)."""
-        # sum_l (P_(l-1)(x) - P_(l+1)(x))/2 P_l(t), t the cosine to the axis
+    def cap_coverage(axis: wp.vec3, sine: float, quadrature: wp.array(dtype=half_values)) -> values:
+        """The cap of directions about a unit axis whose half-angle, at most a right one, has this sine."""
+        # The integral of P_l over the cap is sine^2 P_l'(x)/(l (l + 1)), x the cosine, which keeps its digits for small
+        # caps; P_(l+1)' = P_(l-1)' + (2l + 1) P_l.
+        x = wp.sqrt(wp.max(1.0 - sine * sine, 0.0))
+        squared = sine * sine
         coefficients = profile()
-        coefficients[0] = 0.5 * (1.0 - x)
+        coefficients[0] = 0.5 * squared / (1.0 + x)
         before = float(1.0)
         now = x
+        slope_before = float(0.0)
+        slope = float(1.0)
         for band in range(1, wp.static(order)):
             n = float(band)
+            coefficients[band] = 0.5 * (2.0 * n + 1.0) / (n * (n + 1.0)) * squared * slope
+            slope_after = slope_before + (2.0 * n + 1.0) * now
             after = ((2.0 * n + 1.0) * x * now - n * before) / (n + 1.0)
-            coefficients[band] = 0.5 * (before - after)
+            slope_before = slope
+            slope = slope_after
             before = now
             now = after
         return kit.zonal_at_directions(coefficients, axis, quadrature)
@@ -100,7 +108,7 @@ def make_coverage(order: int) -> SimpleNamespace:
             distance = wp.length(offset)
             # Inside, by contact, counts as on the surface.
             sine = wp.min(radius / wp.max(distance, 1.0e-9), 1.0)
-            return cap_coverage(offset / wp.max(distance, 1.0e-9), wp.sqrt(1.0 - sine * sine), quadrature)
+            return cap_coverage(offset / wp.max(distance, 1.0e-9), sine, quadrature)
         if shape == wp.static(SLAB_SHAPE):
             to_world = rotation * occluders.slab_rotation[entity]
             p_slab = wp.transpose(to_world) * (p_world - position - rotation * occluders.slab_center[entity])

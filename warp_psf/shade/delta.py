@@ -82,7 +82,7 @@ def bulb_point(ray: int, count: int) -> wp.vec2:
     return wp.vec2(radius * wp.cos(6.2831853 * turned), radius * wp.sin(6.2831853 * turned))
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _add_delta_lights(
     first: int,
     receivers: ReceiverTable,

@@ -181,7 +181,7 @@ def make_direct(order: int) -> SimpleNamespace:
                 glossy *= share
         return diffuse, glossy
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def shade_receivers(
         first: int,
         receivers: ReceiverTable,
@@ -224,7 +224,7 @@ def make_direct(order: int) -> SimpleNamespace:
         if surface.first_transfer >= 0 and lights > 0:
             # 1 minus what the body itself blocks above the horizon.
             open_to_self += interpolate(lighting.self_visibility, surface, rows)
-            open_to_self -= kit.cap_coverage(n, 0.0, o.quadrature)
+            open_to_self -= kit.cap_coverage(n, 1.0, o.quadrature)
         for light in range(lights):
             if light > 0:
                 shining = lighting.light_entity[light]

@@ -33,7 +33,7 @@ class Lattice:
     height: int
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _begin(
     first: int,
     receivers: ReceiverTable,
@@ -55,6 +55,7 @@ def _begin(
 
 @wp.func
 def nearly_equal(a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
+    """Whether the light at a cell's corners differs little."""
     highest = wp.max(wp.max(a, b), wp.max(c, d))
     lowest = wp.min(wp.min(a, b), wp.min(c, d))
     return wp.max(highest - lowest) <= SMOOTH_LIGHT * wp.max(highest)
@@ -97,6 +98,7 @@ def has_bent_side(
     height: int,
     stride: int,
 ) -> bool:
+    """Whether light bends along any side of a cell."""
     down = stride * width
     x = corner % width
     y = corner / width
@@ -117,7 +119,6 @@ def is_smooth(
     receivers: ReceiverTable,
     diffuse: wp.array2d(dtype=wp.vec3),
     glossy: wp.array2d(dtype=wp.vec3),
-    turns: wp.array2d(dtype=wp.int32),
     world: int,
     corner: int,
     width: int,
@@ -129,7 +130,7 @@ def is_smooth(
     below = corner + stride * width
     across = below + stride
     entity = receivers.entity[world, corner]
-    if entity < 0 or turns[world, right] == 0 or turns[world, below] == 0 or turns[world, across] == 0:
+    if entity < 0:
         return False
     normal = receivers.normal[world, corner]
     for y in range(stride + 1):
@@ -149,7 +150,7 @@ def is_smooth(
     )
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _refine(
     first: int,
     receivers: ReceiverTable,
@@ -169,11 +170,11 @@ def _refine(
     corner = y_0 * width + x_0
     smooth = x_0 + stride < width and y_0 + stride < height
     if smooth:
-        smooth = is_smooth(receivers, diffuse, glossy, turns, world, corner, width, height, stride)
+        smooth = is_smooth(receivers, diffuse, glossy, world, corner, width, height, stride)
     right = corner + stride
     below = corner + stride * width
     across = below + stride
-    half = wp.max(stride / 2, 1)
+    half = stride / 2
     for y in range(wp.min(stride, height - y_0)):
         for x in range(wp.min(stride, width - x_0)):
             pixel = corner + y * width + x

@@ -21,7 +21,7 @@ from warp_psf.shade.directions import quadrature_rows
 # face-on a sphere of radius R at distance d takes (R/d)^2. It fades in up to twice the share, so that nothing pops.
 SMALLEST_SHARE = 1.0e-3
 # A body whose bounding sphere lies below the receiver's horizon is left out too: what band-limited functions let
-# through there is not real. It fades in as it rises by this share of its radius.
+# through there is not real. It fades in as it rises by this share of its radius; slabs have a horizon of their own.
 HORIZON_FADE = 0.6
 # A slab whose corners rise above the receiver's tangent plane by less than this share of its half-diagonal counts as
 # below it: the floor beside a receiver on the same floor.
@@ -51,12 +51,6 @@ def make_occlude(order: int) -> SimpleNamespace:
         quadrature: wp.array(dtype=half_values)  # x, y, z of the first half of the directions
 
     @wp.func
-    def rise_over_horizon(height: float, radius: float) -> float:
-        """0 for a sphere that lies below the receiver's tangent plane, 1 for one well above it; smooth between."""
-        risen = wp.clamp((height + radius) / (wp.static(HORIZON_FADE) * radius), 0.0, 1.0)
-        return risen * risen * (3.0 - 2.0 * risen)
-
-    @wp.func
     def matters(
         entity: int, own: int, p: wp.vec3, n: wp.vec3, center: wp.vec3, radius: float, rotation: wp.mat33, o: Occlusion
     ) -> float:
@@ -67,13 +61,15 @@ def make_occlude(order: int) -> SimpleNamespace:
         height = wp.dot(n, offset)
         if height < -radius:
             return 0.0
+        share = radius * radius / wp.max(wp.dot(offset, offset), 1.0e-12)
+        size = wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
         if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
             half = o.occluders.slab_half[entity]
             n_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity]) * n
             rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
-            return wp.where(height + rise > wp.static(SLAB_HORIZON) * radius, 1.0, 0.0)
-        share = radius * radius / wp.max(wp.dot(offset, offset), 1.0e-12)
-        return rise_over_horizon(height, radius) * wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
+            return size * wp.where(height + rise > wp.static(SLAB_HORIZON) * radius, 1.0, 0.0)
+        risen = wp.min((height + radius) / (wp.static(HORIZON_FADE) * radius), 1.0)
+        return size * risen * risen * (3.0 - 2.0 * risen)
 
     @wp.func
     def nearness(
@@ -173,7 +169,7 @@ def make_occlude(order: int) -> SimpleNamespace:
                     before = wp.cw_mul(before, values(1.0) - weight * covered)
         return visible, before
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def turn_basis(
         first: int,
         poses: PoseTable,
@@ -191,7 +187,6 @@ def make_occlude(order: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(kit),
         Occlusion=Occlusion,
-        rise_over_horizon=rise_over_horizon,
         visibility_at=visibility_at,
         turn_basis=turn_basis,
     )

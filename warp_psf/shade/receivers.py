@@ -30,7 +30,7 @@ class VertexReceivers:
     receivers: ReceiverTable
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _mark_needed(first: int, pixels: ReceiverTable, geometry: GeometryTable, vertices: VertexTable):
     world, slot = wp.tid()
     slot += first
@@ -45,7 +45,7 @@ def _mark_needed(first: int, pixels: ReceiverTable, geometry: GeometryTable, ver
         vertices.needed[world, start + corners[2]] = 1
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _place_vertices(
     first: int,
     geometry: GeometryTable,
@@ -69,7 +69,7 @@ def _place_vertices(
     receivers.normal[world, vertex] = rotation * geometry.normals[start]
 
 
-@wp.kernel(module="unique")
+@wp.kernel(enable_backward=False, module="unique")
 def _interpolate_vertices(
     first: int,
     pixels: ReceiverTable,
