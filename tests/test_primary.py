@@ -224,12 +224,9 @@ def test_edges_blend_with_the_background():
 
 def test_a_telephoto_view_loses_no_pixels():
     # Angles of a hundredth of a degree: acos has no digits for them in float32.
-    xml = (
-        '<geom type="sphere" size=".01" pos="0 0 0"/><camera name="far" pos="0 -20 0" xyaxes="1 0 0 0 0 1" fovy=".1"/>'
-    )
-    renderer, data = make_renderer(
-        '<geom type="sphere" size=".01"/>' + camera, 90, 90, header="<visual><quality offsamples='0'/></visual>"
-    )
+    camera = '<camera name="far" pos="0 -20 0" xyaxes="1 0 0 0 0 1" fovy=".1"/>'
+    header = "<visual><quality offsamples='0'/></visual>"
+    renderer, data = make_renderer('<geom type="sphere" size=".01"/>' + camera, 90, 90, header=header)
     renderer.update_scene(data, "far")
     seen = (renderer.layers()["segmentation"][..., 0] >= 0).sum()
     radius = 45 * (0.01 / 20) / np.tan(np.deg2rad(0.05))
