@@ -77,12 +77,22 @@ def simulate(model: mujoco.MjModel, frames_per_second: float) -> Iterator[mujoco
 
     Yields the same `MjData` every time, stepped on; frame 0 is the start. Simulated time follows the frames' to the
     nearest step.
+
+    Raises:
+        ValueError: the simulation diverges; MuJoCo starts it anew then, which no film should show.
     """
     data = mujoco.MjData(model)
+    steps = 0
     for frame in itertools.count():
         target = round(frame / frames_per_second / model.opt.timestep)
-        while round(data.time / model.opt.timestep) < target:
+        for _ in range(target - steps):
+            before = data.time
             mujoco.mj_step(model, data)
+            if data.time <= before:
+                raise ValueError(
+                    f"the simulation diverged at {before:g} s; give the model a shorter timestep or softer contacts"
+                )
+        steps = target
         # A step leaves the poses of bodies and geoms one step behind the joints.
         mujoco.mj_forward(model, data)
         yield data
