@@ -273,3 +273,16 @@ def test_bad_arguments_are_named(tmp_path):
     with make(tmp_path / "in") as sequence, pytest.raises(ValueError, match="frame 6"):
         sequence.missing(6)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("formats", [("exr", "mp4"), ("png", "mp4")])
+def test_a_damaged_frame_is_named_with_its_remedy(tmp_path, formats):
+    run(tmp_path, formats=formats)
+    path = tmp_path / f"frame_0003.{formats[0]}"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=rf"{path.name} .*: remove it and run again"):
+        run(tmp_path, formats=formats)
+    path.unlink()
+    assert run(tmp_path, formats=formats) == [3]
+    assert path.read_bytes() == whole

@@ -439,12 +439,8 @@ def _find_camera(model: mujoco.MjModel, camera: int | str | mujoco.MjvCamera) ->
 
 
 def _known_cameras(model: mujoco.MjModel) -> str:
-    names = [_label(model, "camera", index) for index in range(model.ncam)]
-    return (
-        f"the model has {', '.join(names)}, and -1 is the free camera"
-        if names
-        else "the model has only -1, the free one"
-    )
+    names = ", ".join(_label(model, "camera", index) for index in range(model.ncam))
+    return f"the model has {names}, and -1 is the free camera" if names else "the model has only -1, the free one"
 
 
 def _camera_name(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> str:

@@ -190,9 +190,13 @@ class FrameSequence:
 
     def _read_picture(self, index: int) -> np.ndarray:
         path = self._frame_paths(index)[-1]
-        if path.suffix == ".png":
-            return read_png(path)
-        return to_display(read_exr(path)["color"], **self._display)
+        try:
+            if path.suffix == ".png":
+                return read_png(path)
+            return to_display(read_exr(path)["color"], **self._display)
+        except ValueError as error:
+            # A frame that is there is not rendered again: somebody must remove it first.
+            raise ValueError(f"{path} is damaged: remove it and run again") from error
 
     def _write_waiting(self) -> None:
         """The writer thread. After a failure it takes frames without writing them, so that nobody waits for it.
