@@ -65,7 +65,10 @@ def pixel_points(depth: np.ndarray, world_from_camera: np.ndarray, fovy: float) 
     y, x = np.mgrid[:height, :width] + 0.5
     scale = 2 * np.tan(fovy / 2) / height
     rays = np.stack([(x - width / 2) * scale, (height / 2 - y) * scale, -np.ones_like(x)], axis=-1)
-    return (depth[..., None] * rays) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+    # Where nothing is, depth is infinite and there is no point.
+    return (np.where(np.isfinite(depth), depth, np.nan)[..., None] * rays) @ world_from_camera[
+        :3, :3
+    ].T + world_from_camera[:3, 3]
 
 
 def near_contact(model, data, points: np.ndarray, floor: int) -> np.ndarray:

@@ -153,18 +153,7 @@ def make_direct(order: int) -> SimpleNamespace:
         if wp.length_sq(facing) > 0.0:
             hidden = hidden or wp.dot(facing, p - center) <= 0.0
         if not hidden:
-            seen = kit.coverage_of(
-                entity,
-                p,
-                position,
-                rotation,
-                geometry.center[entity],
-                radius,
-                o.occluders,
-                o.fields,
-                o.rows[world, entity],
-                o.quadrature,
-            )
+            seen = kit.covered_by(world, entity, p, geometry, poses, o)
             weighted = wp.cw_mul(seen, lighting.weights[0])
             whole = wp.max(kit.sum_of_products(weighted, values(1.0)), 1.0e-9)
             share = wp.clamp(kit.sum_of_products(weighted, before) / whole, 0.0, 1.0)

@@ -34,7 +34,7 @@ LIGHT_FADE = 0.25
 
 @cache
 def make_occlude(order: int) -> SimpleNamespace:
-    """Device functions for `order` bands: `visibility_at` and its tables."""
+    """Device functions for `order` bands: `covered_by`, `visibility_at`, and their tables."""
     kit = make_coverage(order)
     values, half_values = kit.values, kit.half_values
     OccluderTable, FieldTable = kit.OccluderTable, kit.FieldTable
@@ -49,6 +49,24 @@ def make_occlude(order: int) -> SimpleNamespace:
         # (world, entity, coefficient): the entity's y_k at the first half of the world's directions
         rows: wp.array3d(dtype=half_values)
         quadrature: wp.array(dtype=half_values)  # x, y, z of the first half of the directions
+
+    @wp.func
+    def covered_by(
+        world: int, entity: int, p: wp.vec3, geometry: GeometryTable, poses: PoseTable, o: Occlusion
+    ) -> values:
+        """The coverage of an entity, where it is in this frame, around a point of the world."""
+        return kit.coverage_of(
+            entity,
+            p,
+            poses.position[world, entity],
+            poses.rotation[world, entity],
+            geometry.center[entity],
+            geometry.radius[entity],
+            o.occluders,
+            o.fields,
+            o.rows[world, entity],
+            o.quadrature,
+        )
 
     @wp.func
     def matters(
@@ -149,18 +167,7 @@ def make_occlude(order: int) -> SimpleNamespace:
             center = position + rotation * geometry.center[entity]
             weight = matters(entity, own, p, n, center, radius, rotation, o)
             if weight > 0.0:
-                covered = kit.coverage_of(
-                    entity,
-                    p,
-                    position,
-                    rotation,
-                    geometry.center[entity],
-                    radius,
-                    o.occluders,
-                    o.fields,
-                    o.rows[world, entity],
-                    o.quadrature,
-                )
+                covered = covered_by(world, entity, p, geometry, poses, o)
                 visible = wp.cw_mul(visible, values(1.0) - weight * covered)
                 if light >= 0:
                     weight *= nearness(
@@ -187,6 +194,7 @@ def make_occlude(order: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(kit),
         Occlusion=Occlusion,
+        covered_by=covered_by,
         visibility_at=visibility_at,
         turn_basis=turn_basis,
     )
