@@ -5,10 +5,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: bowling falling statues test check clean
+.PHONY: bowling falling statues room teapots test check clean
 .DELETE_ON_ERROR:
 
-bowling falling statues: .venv/installed
+bowling falling statues room teapots: .venv/installed
 	$(BIN)/python -m sims.$@ --out out/$@ $(ARGS)
 
 test: .venv/installed-dev

@@ -1,6 +1,6 @@
-"""Simulations to render: bowling, falling, statues; `python -m sims.bowling` simulates and renders one.
+"""Simulations to render: bowling, falling, statues, room, teapots; `python -m sims.bowling` simulates and renders one.
 
-Each of the three modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
+Each of the five modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
 `lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the
 geoms that do are in group 3, which is not drawn.
 """
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 HIDDEN_GROUP = 3
 # Seconds: two steps are the shortest time constant that MuJoCo's contacts keep stable.
 TIMESTEP = 0.001
+# Metres: the walls of rooms.
+WALL_THICKNESS = 0.1
 # A satin highlight, as broad as four bands of spherical harmonics can show.
 SHININESS = 0.08
 
@@ -77,6 +79,28 @@ def draw_box(body: mujoco.MjsBody, name: str, low: tuple, high: tuple, material:
         mass=0,
         group=0,
     )
+
+
+def draw_room(
+    spec: mujoco.MjSpec, low: tuple[float, float, float], high: tuple[float, float, float], materials: dict[str, str]
+) -> None:
+    """Encloses the space between two corners, metres, with six boxes that neither collide nor leave a gap.
+
+    materials: of floor, ceiling, left (-x), right (+x), front (-y) and back (+y).
+    """
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    t = WALL_THICKNESS
+    # Each pair reaches over the ends of the pairs after it, so that no two surfaces share a plane the room can see.
+    boxes = {
+        "floor": ((x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0)),
+        "ceiling": ((x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t)),
+        "left": ((x0 - t, y0 - t, z0), (x0, y1 + t, z1)),
+        "right": ((x1, y0 - t, z0), (x1 + t, y1 + t, z1)),
+        "front": ((x0, y0 - t, z0), (x1, y0, z1)),
+        "back": ((x0, y1, z0), (x1, y1 + t, z1)),
+    }
+    for name, (start, end) in boxes.items():
+        draw_box(spec.worldbody, name, start, end, materials[name])
 
 
 def dimmed(name: str, share: float, turn: float = 0.0) -> psf.Environment:

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import copy
+import math
+
 import mujoco
 import numpy as np
 import pytest
 
-from sims import HIDDEN_GROUP, bodies, bowling, falling, statues
+from sims import HIDDEN_GROUP, bodies, bowling, falling, furniture, room, statues, teapots
 
-SIMULATIONS = {"bowling": bowling, "falling": falling, "statues": statues}
-# Drawn bodies and vertices of the scenes of figures 9 to 11 of the paper on adaptive shadow fields.
-PAPER = {"bowling": (15, 41340), "falling": (20, 88739), "statues": (6, 32875)}
+SIMULATIONS = {"bowling": bowling, "falling": falling, "statues": statues, "room": room, "teapots": teapots}
+# Drawn bodies and vertices of the scenes of figures 9 to 11 of the paper on adaptive shadow fields, and of figures 6
+# and 7 of the paper on light interreflection; these count the six sides of the room, and the former a rug.
+PAPER = {
+    "bowling": (15, 41340),
+    "falling": (20, 88739),
+    "statues": (6, 32875),
+    "room": (17, 50000),
+    "teapots": (36, 122000),
+}
+ROOMS = {"room": room, "teapots": teapots}
 # A gridded box has 12 cells along each edge and does not share vertices between its sides.
 BOX_VERTICES = 6 * 13**2
 FRAMES_PER_SECOND, DURATION = 30, 4.0
@@ -33,6 +44,11 @@ BODIES = {
     "pedestal": bodies.pedestal,
     "raised": lambda: bodies.statue_like("raised", cells=statues.RAISED_CELLS),
     "staff": lambda: bodies.statue_like("staff", cells=statues.STAFF_CELLS),
+    "sofa": furniture.sofa,
+    "armchair": lambda: furniture.sofa(room.ARMCHAIR_WIDTH, seats=1),
+    "coffee_table": furniture.coffee_table,
+    "floor_lamp": furniture.floor_lamp,
+    "potted_plant": furniture.potted_plant,
 }
 
 
@@ -158,6 +174,14 @@ def test_pins_stand_until_the_ball_comes(models):
         assert abs(data.body(f"pin_{number}").xpos[2]) < 5e-4
 
 
+@pytest.mark.parametrize("name", SIMULATIONS)
+def test_states_are_finite(name: str, runs):
+    frames, data = runs[name]
+    assert np.isfinite(frames).all()
+    # MuJoCo counts here when it starts a diverged simulation anew.
+    assert not any(warning.number for warning in data.warning)
+
+
 @pytest.mark.parametrize("name", ["bowling", "falling"])
 def test_bodies_come_to_rest_above_the_floor(name: str, models, runs):
     model, (_, data) = models[name], runs[name]
@@ -199,3 +223,113 @@ def test_statues_move_apart(models):
     pairs = ~np.eye(flat.shape[1], dtype=bool)
     # Plinths, staffs and the pedestal keep clear of each other.
     assert distance[:, pairs].min() > 0.7
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_room_is_closed(name: str, models):
+    """From points all over the room, a ray in any direction meets one of the six sides where the room ends."""
+    model, (low, high) = models[name], (np.array(ROOMS[name].LOW), np.array(ROOMS[name].HIGH))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    random = np.random.default_rng(6)
+    # The sides of the room alone: whatever else is drawn leaves for a group that the rays do not meet.
+    bare = copy.copy(model)
+    sides = {bare.geom(side).id for side in ("floor", "ceiling", "left", "right", "front", "back")}
+    bare.geom_group[[geom for geom in range(bare.ngeom) if geom not in sides]] = HIDDEN_GROUP
+    seen = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+    met = set()
+    for _ in range(2000):
+        start = random.uniform(low + 0.01, high - 0.01)
+        # Half of the rays go towards the room's edges, where a gap would be.
+        aim = random.normal(size=3)
+        if random.random() < 0.5:
+            aim = np.where(
+                random.permutation(3) == 0, random.uniform(low, high), np.where(random.random(3) < 0.5, low, high)
+            )
+            aim -= start
+        aim /= np.linalg.norm(aim)
+        geom = np.array([-1], np.int32)
+        distance = mujoco.mj_ray(bare, data, start, aim, seen, 1, -1, geom)
+        with np.errstate(divide="ignore"):
+            expected = np.min(np.where(aim > 0, (high - start) / aim, (low - start) / aim))
+        assert geom[0] in sides
+        assert distance == pytest.approx(expected, abs=1e-6)
+        met.add(int(geom[0]))
+    assert met == sides
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_everything_stays_in_the_room(name: str, models):
+    model, (low, high) = models[name], (np.array(ROOMS[name].LOW), np.array(ROOMS[name].HIGH))
+    meshes = [geom for geom in _drawn(model) if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH]
+    for data in ROOMS[name].states(model, 5, DURATION):
+        assert (data.camera("front").xpos > low).all() and (data.camera("front").xpos < high).all()
+        for geom in meshes:
+            vertices = _world_vertices(model, data, geom)
+            # Contacts give way by less than this, metres.
+            assert (vertices > low - 2e-3).all() and (vertices < high + 2e-3).all()
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_light_hangs_under_the_ceiling(name: str):
+    (light,) = ROOMS[name].lights()
+    corners = light.mesh.vertices @ light.rotation.T + light.position
+    assert light.rotation[:, 2] == pytest.approx([0, 0, -1])
+    assert np.ptp(corners, axis=0) == pytest.approx([ROOMS[name].LIGHT_SIDE, ROOMS[name].LIGHT_SIDE, 0], abs=1e-6)
+    assert (corners[:, :2] > ROOMS[name].LOW[:2]).all() and (corners[:, :2] < ROOMS[name].HIGH[:2]).all()
+    assert 0 < ROOMS[name].HIGH[2] - corners[:, 2].max() < 0.05
+
+
+def test_room_has_one_glossy_statue_that_turns(models, runs):
+    model, (_, data) = models["room"], runs["room"]
+    glossy = [model.geom(geom).id for geom in _drawn(model) if model.mat_specular[model.geom_matid[geom]] > 0]
+    (statue,) = model.body("statue").geomadr
+    assert glossy == [statue]
+    turned = 2 * np.arccos(abs(data.mocap_quat[0, 0]))
+    assert turned == pytest.approx(room.STATUE_SPEED * data.time, abs=1e-6)
+
+
+def test_ball_bounces_through_the_room(models):
+    model = models["room"]
+    path, rug = [], model.geom("rug")
+    low, high = rug.pos - rug.size, rug.pos + rug.size
+    for data in room.states(model, FRAMES_PER_SECOND, DURATION):
+        position = data.body("ball").xpos.copy()
+        path.append(position)
+        nearest = np.clip(position, low, high)
+        assert np.linalg.norm(position - nearest) > room.BALL_RADIUS - 1e-3
+    path = np.array(path)
+    # It rises again after it fell, and crosses most of the room.
+    rises = np.diff(np.sign(np.diff(path[:, 2])))
+    assert (rises > 0).sum() >= 2
+    assert np.ptp(path[:, 0]) > 2.5
+    assert path[-1, 2] == pytest.approx(room.BALL_RADIUS, abs=2e-3)
+
+
+def test_teapots_share_a_mesh_and_four_are_glossy(models):
+    model = models["teapots"]
+    assert model.nmesh == 1
+    geoms = [geom for geom in _drawn(model) if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH]
+    gloss = model.mat_specular[model.geom_matid[geoms]]
+    assert len(geoms) == 30 and (gloss > 0).sum() == 4
+    assert len(np.unique(model.geom_matid[geoms])) == 1 + len(teapots.COLORS)
+
+
+def test_teapots_move_without_touching(models):
+    model = models["teapots"]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    upright = _world_vertices(model, data, _drawn(model)[-1]) - data.mocap_pos[-1]
+    reach = np.hypot(upright[:, 0], upright[:, 1]).max()
+    places, turns = [], []
+    for data in teapots.states(model, 10, 2 * math.pi / min(abs(speed) for _, _, speed, _ in teapots.RINGS)):
+        places.append(data.mocap_pos[:, :2].copy())
+        turns.append(data.mocap_quat.copy())
+    places, turns = np.array(places), np.array(turns)
+    assert np.abs(turns[..., 1:3]).max() == 0.0
+    assert np.abs(np.einsum("tpi,tpi->tp", turns[:-1], turns[1:])).max() < 1.0
+    assert np.linalg.norm(np.diff(places, axis=0), axis=2).min() > 0.005
+    # No two of the upright cylinders that the teapots turn in meet, in a whole turn of the slowest ring.
+    pairs = np.triu_indices(places.shape[1], 1)
+    distance = np.linalg.norm(places[:, pairs[0]] - places[:, pairs[1]], axis=2)
+    assert distance.min() > 2 * reach + 0.01

@@ -12,25 +12,36 @@ import numpy as np
 import warp as wp
 
 from warp_psf.bake import BakedBody, bake_mesh, bake_radiance_field
+from warp_psf.bake.radiance import BakedRadiance, bake_radiance
 from warp_psf.bridge import build_scene, read_camera, read_delta_lights, read_poses
 from warp_psf.device import find_device
+from warp_psf.field.radiance import FUNCTION_COUNTS
 from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
-from warp_psf.film.primary import aim, find_surfaces, make_surfaces
+from warp_psf.film.primary import EXTRA_GROUPS, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import make_film, read_layers, resolve_pixels
-from warp_psf.scene.detail import refine_flat_bodies
+from warp_psf.scene.detail import refine_flat_bodies, refine_radiating
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.geometry import upload_scene, write_poses
 from warp_psf.scene.light import Light, area_light_entities
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.scene import Poses
+from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances, upload_bounces
 from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
 from warp_psf.shade.lattice import STRIDES, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occlude import turn_occlusion, upload_occlusion
+from warp_psf.shade.probes import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
 # A picture of more pixels than this is a mistyped size: its buffers would take over 30 GB.
 MOST_PIXELS = 2**27
+# After so many bounces between white walls a fiftieth of the light is left.
+MOST_BOUNCES = 16
+# Boxes whose shortest side is less than this share of the longest are floors, walls and beams: shells around their
+# centre would serve badly what lies on them.
+THICK = 0.25
 # Shadow rays towards directional lights end after this many extents of the model.
 DIRECTIONAL_REACH = 1000.0
 Progress = Callable[[str, float], None]
@@ -48,6 +59,9 @@ class Renderer:
     environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
         HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
     lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
+    bounces: how often light is passed on between the bodies, 0 to 16; 0 leaves only direct light.
+    bounce_threshold: a body that takes up a smaller share of a point's view than this sends it no bounced light.
+    basis_functions: how many functions per body stand for the light that leaves it: 4, 8, 16 or 32.
     order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
     shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
         planes are cut finely enough for that; other meshes show what their vertices resolve, and open ones the light of
@@ -73,6 +87,9 @@ class Renderer:
         environment: str | np.ndarray | Environment | None = "studio",
         lights: Sequence[Light] = (),
         order: int = 4,
+        bounces: int = 3,
+        bounce_threshold: float = 0.004,
+        basis_functions: int = 16,
         shading: str = "pixel",
         material_space: str = "srgb",
         model_lights: bool = True,
@@ -83,18 +100,25 @@ class Renderer:
     ):
         _check_model(model)
         _check_options(height, width, order, shading, exposure, view)
+        _check_bounces(bounces, bounce_threshold, basis_functions)
         self._model, self._height, self._width = model, int(height), int(width)
         self._order, self._shading = int(order), shading
+        self._bounce_count, self._bounce_threshold = int(bounces), float(bounce_threshold)
         self._exposure, self._view = exposure, view
         self._device = find_device(device)
         self._environment = load_environment(environment)
         self._scene = build_scene(model, material_space=material_space, lights=lights, model_lights=model_lights)
         if shading == "vertex":
             self._scene = refine_flat_bodies(self._scene)
-        self._upload(self._bake(progress or (lambda what, share: None)))
+        report = progress or (lambda what, share: None)
+        self._upload(self._bake(report))
+        self._bounces = self._last_gather = None
+        if self._bounce_count:
+            self._upload_bounces(int(basis_functions), report)
         self._depth_rendering = self._segmentation_rendering = False
         self._world_from_camera: np.ndarray | None = None
-        self._drawn = self._closed = False
+        self._poses: Poses | None = None
+        self._drawn = self._closed = self._has_moved = False
         self._stage_seconds: dict[str, float] = {}
 
     @property
@@ -145,6 +169,8 @@ class Renderer:
         self._check_open()
         view = read_camera(self._model, data, camera)
         poses = read_poses(self._model, data, self._scene)
+        self._has_moved = self._has_moved or not _same_poses(poses, self._poses)
+        self._poses = poses
         lights = read_delta_lights(self._model, data, self._scene, view)
         write_poses(self._device_scene, poses)
         aim(self._surfaces, [view])
@@ -187,8 +213,8 @@ class Renderer:
     def layers(self) -> dict[str, np.ndarray]:
         """The layers of the last `update_scene`, as arrays of their own.
 
-        `color`: radiance with background and luminous surfaces; `direct`: light reflected once; `albedo`; `normal` in
-        the world: all float32 [height, width, 3], scene-linear. `depth`: metres along the optical axis, infinite where
+        `color`: radiance with background and luminous surfaces; `direct`: the part that lights and environment cause
+        by one reflection; `indirect`: the part that came by other bodies; `albedo`; `normal` in the world: all float32 [height, width, 3], scene-linear. `depth`: metres along the optical axis, infinite where
         nothing is, float32 [height, width]. `segmentation`: object id and type, -1 where nothing is, int32
         [height, width, 2].
         """
@@ -216,7 +242,8 @@ class Renderer:
         if not self._closed:
             self._closed = True
             del self._device_scene, self._surfaces, self._film, self._occlusion, self._lighting
-            del self._delta_lights, self._received, self._lattice, self._vertices
+            del self._delta_lights, self._received, self._bounced, self._lattice, self._vertices
+            del self._bounces, self._last_gather
             if self._shading == "vertex":
                 del self._vertices_received, self._vertices_turns
 
@@ -275,12 +302,41 @@ class Renderer:
         self._surfaces = make_surfaces(1, self._width, self._height, len(scene.entities), antialias, device)
         self._film = make_film(1, self._width, self._height, background, device)
         self._received = self._make_received(self._surfaces.slots)
+        self._bounced = self._make_received(self._surfaces.slots)
         self._lattice = make_lattice(1, self._surfaces.slots, self._width, self._height, device)
         self._vertices = None
         if self._shading == "vertex":
             self._vertices = upload_vertices(scene, 1, device)
             self._vertices_received = self._make_received(self.vertices)
             self._vertices_turns = wp.full((1, self.vertices), 1, dtype=wp.int32, device=device)
+
+    def _upload_bounces(self, functions: int, progress: Progress) -> None:
+        """Bakes what leaves the bodies, and makes room for the bounces."""
+        scene, device = self._scene, self._device
+        is_patch = [
+            casts and _is_patch(scene.meshes[e.mesh]) for e, casts in zip(scene.entities, self._casts, strict=True)
+        ]
+        radiating: dict[int, tuple[Mesh, BakedRadiance]] = {}
+        for entity, casts, flat in zip(scene.entities, self._casts, is_patch, strict=True):
+            if not casts or flat or entity.mesh in radiating:
+                continue
+            mesh = refine_radiating(scene.meshes[entity.mesh])
+
+            def report(share: float, name: str = mesh.name) -> None:
+                progress(f"baking light of {name}", share)
+
+            radiating[entity.mesh] = (
+                mesh,
+                bake_radiance(mesh, self._order, functions, device=str(device), progress=report),
+            )
+        of_entity = [
+            radiating[entity.mesh] if casts and not flat else None
+            for entity, casts, flat in zip(scene.entities, self._casts, is_patch, strict=True)
+        ]
+        self._bounces = upload_bounces(scene, of_entity, is_patch, self._occlusion, functions, 1, device)
+        slots = self._surfaces.slots
+        room = (self._bounce_threshold, self._width, self._height, slots)
+        self._last_gather = make_last_gather(self._bounces, *room, device)
 
     def _make_received(self, count: int) -> tuple[wp.array, wp.array]:
         """Irradiance and Phong radiance of `count` receivers."""
@@ -309,9 +365,28 @@ class Renderer:
         with self._timed("shadow rays"):
             casts, eye = self._occlusion.table.occluders.casts, self._lighting.table.eye
             add_delta_lights(pixels, scene, casts, eye, self._delta_lights, *self._received, device)
+        if self._bounces is not None and self._last_gather is not None:
+            self._bounce(self._bounces, self._last_gather)
         with self._timed("resolve pixels"):
-            resolve_pixels(self._film, self._surfaces, scene, *self._received, device)
+            resolve_pixels(self._film, self._surfaces, scene, self._received, self._bounced, device)
         self._drawn = True
+
+    def _bounce(self, bounces: BounceState, last_gather: LastGather) -> None:
+        scene, device, lights = self._device_scene, self._device, (self._occlusion, self._lighting)
+        if self._has_moved:
+            with self._timed("basis irradiances"):
+                gather_basis_irradiances(bounces, scene, *lights, self._bounce_threshold, device)
+            self._has_moved = False
+        with self._timed("light on proxies"):
+            shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, *bounces.received, device)
+            casts, eye = self._occlusion.table.occluders.casts, self._lighting.table.eye
+            add_delta_lights(bounces.proxies, scene, casts, eye, self._delta_lights, *bounces.received, device)
+        with self._timed("bounces"):
+            bounce(bounces, scene, self._occlusion, self._bounce_count, device)
+        with self._timed("last gather"):
+            surfaces = self._surfaces
+            seen = (surfaces.receivers, surfaces.extra, EXTRA_GROUPS)
+            gather_last_bounce(last_gather, *seen, scene, *lights, self._received[0], self._bounced, device)
 
     def _shade_pixels(self) -> None:
         scene, device, pixels = self._device_scene, self._device, self._surfaces.receivers
@@ -350,6 +425,24 @@ def _check_model(model: mujoco.MjModel) -> None:
         raise TypeError(
             f"model is a {type(model).__name__}; give a mujoco.MjModel, for example mujoco.MjModel.from_xml_path(path)"
         )
+
+
+def _same_poses(a: Poses, b: Poses | None) -> bool:
+    return b is not None and np.array_equal(a.position, b.position) and np.array_equal(a.rotation, b.rotation)
+
+
+def _is_patch(mesh: Mesh) -> bool:
+    """Whether light leaves the shape through textured faces: what is flat or long, unlike a die."""
+    return mesh.slab is not None and mesh.slab[2].min() < THICK * mesh.slab[2].max()
+
+
+def _check_bounces(bounces: int, threshold: float, functions: int) -> None:
+    if int(bounces) != bounces or not 0 <= bounces <= MOST_BOUNCES:
+        raise ValueError(f"bounces is {bounces}; give a whole number from 0 to {MOST_BOUNCES}")
+    if not 0.0 < threshold < 1.0:
+        raise ValueError(f"bounce_threshold is {threshold}; give a share between 0 and 1")
+    if functions not in FUNCTION_COUNTS:
+        raise ValueError(f"basis_functions is {functions}; choose one of {', '.join(map(str, FUNCTION_COUNTS))}")
 
 
 def _check_options(height: int, width: int, order: int, shading: str, exposure: float, view: str) -> None:

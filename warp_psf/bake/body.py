@@ -13,7 +13,6 @@ from warp_psf.bake import visibility
 from warp_psf.bake.adapt import ERROR_THRESHOLD, reduce_shell
 from warp_psf.bake.kept import BakedBody, load_body, save_body
 from warp_psf.bake.transfer import bake_transfer
-from warp_psf.basis import sh
 from warp_psf.device import find_device
 from warp_psf.field.shells import (
     FINEST_RESOLUTION,
@@ -34,6 +33,7 @@ ORDERS = range(2, 7)
 # Samples that left the solid at points this close, in bounding radii, left it at the same point.
 SAME_POINT = 1.0e-5
 Progress = Callable[[float], None]
+Project = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def bake_mesh(
@@ -53,7 +53,7 @@ def bake_mesh(
     Raises:
         ValueError: the order or the threshold is out of range.
     """
-    _check_settings(mesh, order, threshold)
+    check_settings(mesh, order, threshold)
     report = progress or (lambda share: None)
     if mesh.slab is not None or mesh.sphere is not None:
         report(1.0)
@@ -88,7 +88,7 @@ def bake_radiance_field(
     Raises:
         ValueError: the order is out of range, or the radiance is not one finite number, at least 0, per face.
     """
-    _check_settings(mesh, order, ERROR_THRESHOLD)
+    check_settings(mesh, order, ERROR_THRESHOLD)
     settings = {"bake": BAKE_VERSION, "kind": "radiance", "order": order, "threshold": ERROR_THRESHOLD}
     settings["closed"] = mesh.closed
     radiance = np.ascontiguousarray(face_radiance, np.float32)
@@ -119,7 +119,7 @@ def bake_field(
     face_radiance: np.ndarray | None = None,
 ) -> ShadowField:
     """Samples every shell, reduces each of them and quantises it."""
-    inner: list[_InnerShell] = []
+    inner: list[InnerShell] = []
     for shell in reversed(range(FIRST_OUTER_SHELL + 1)):
         inner.insert(0, _bake_inner_shell(mesh, warp_mesh, shell, order, device, face_radiance, inner[:1]))
         report(len(inner) / SHELL_COUNT)
@@ -138,7 +138,7 @@ def bake_field(
 
 
 @dataclass(frozen=True)
-class _InnerShell:
+class InnerShell:
     """A shell no larger than the bounding sphere.
 
     points: where each sample was taken, float32 [samples, 3]; inside: which ones had to leave the solid for that;
@@ -157,30 +157,50 @@ def _bake_inner_shell(
     order: int,
     device: wp.Device,
     face_radiance: np.ndarray | None,
-    next_shell: list[_InnerShell],
-) -> _InnerShell:
+    next_shell: list[InnerShell],
+) -> InnerShell:
+    """Samples a shell of an occlusion or source radiance field (see `sample_inner_shell`)."""
+
+    def project(points: np.ndarray, outward: np.ndarray) -> np.ndarray:
+        return _project(mesh, warp_mesh, shell, points, outward, order, device, face_radiance)
+
+    return sample_inner_shell(mesh, warp_mesh, shell, FINEST_RESOLUTION, project, device, next_shell)
+
+
+def sample_inner_shell(
+    mesh: Mesh,
+    warp_mesh: wp.Mesh,
+    shell: int,
+    resolution: int,
+    project: Project,
+    device: wp.Device,
+    next_shell: list[InnerShell],
+) -> InnerShell:
     """Samples a shell whose samples may lie inside the solid; `next_shell` holds the one around it, if it has one.
 
     A sample inside the solid would be covered all around and darken receivers outside. It is moved along its radius
     to the surface instead, where it tells what the nearest receivers outside see. Where the next shell's sample went
     to the same point, its vector is taken over.
+
+    project: gives the vectors, float32 [N, K], at points [N, 3] whose directions from the centre are known, [N, 3].
     """
-    points, outward = _sample_points(mesh, shell)
+    points, outward = _sample_points(mesh, shell, resolution)
     points, inside = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, mesh.closed, points, device)
-    vectors = np.empty((len(points), sh.coefficient_count(order)), np.float32)
     known = np.zeros(len(points), bool)
     if next_shell:
         apart = np.linalg.norm(points - next_shell[0].points, axis=1)
         known = inside & (apart < SAME_POINT * mesh.radius)
+    projected = project(points[~known], outward[~known])
+    vectors = np.empty((len(points), projected.shape[1]), np.float32)
+    vectors[~known] = projected
+    if next_shell:
         vectors[known] = next_shell[0].vectors[known]
-    new = ~known
-    vectors[new] = _project(mesh, warp_mesh, shell, points[new], outward[new], order, device, face_radiance)
-    return _InnerShell(points, inside, vectors)
+    return InnerShell(points, inside, vectors)
 
 
-def _sample_points(mesh: Mesh, shell: int) -> tuple[np.ndarray, np.ndarray]:
+def _sample_points(mesh: Mesh, shell: int, resolution: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """A shell's samples in the body's frame, float32 [samples, 3], and their directions from the centre, float64."""
-    outward = sample_directions(FINEST_RESOLUTION).reshape(-1, 3)
+    outward = sample_directions(resolution or FINEST_RESOLUTION).reshape(-1, 3)
     return (mesh.center + shell_radii(mesh.radius)[shell] * outward).astype(np.float32), outward
 
 
@@ -195,13 +215,19 @@ def _project(
     face_radiance: np.ndarray | None,
 ) -> np.ndarray:
     """The vectors at points of a shell, float32 [N, coefficients], with the rays that its distance asks for."""
+    half_angle, rays = cone_of_shell(shell)
+    axes = (-outward).astype(np.float32)
+    return visibility.project_coverage(warp_mesh, points, axes, half_angle, rays, order, device, face_radiance)
+
+
+def cone_of_shell(shell: int) -> tuple[float, int]:
+    """The half angle, radians, of the cone that holds the bounding sphere, and the rays that the distance asks for."""
     radii = SHELL_SPACING * (1 + shell)
     half_angle = math.pi
     if radii >= 1.0:
         # A little wider than the bounding sphere, whose radius is exact to float32 only.
         half_angle = min(1.001 * math.asin(1 / radii), math.pi / 2)
-    rays, axes = visibility.rays_at(radii), (-outward).astype(np.float32)
-    return visibility.project_coverage(warp_mesh, points, axes, half_angle, rays, order, device, face_radiance)
+    return half_angle, visibility.rays_at(radii)
 
 
 def can_be_read(inside: list[np.ndarray], shell: int) -> np.ndarray:
@@ -228,7 +254,8 @@ def upload_mesh(mesh: Mesh, device: wp.Device) -> wp.Mesh:
     )
 
 
-def _check_settings(mesh: Mesh, order: int, threshold: float | None) -> None:
+def check_settings(mesh: Mesh, order: int, threshold: float | None) -> None:
+    """Refuses an order or a threshold that nothing can be baked with."""
     if order not in ORDERS:
         raise ValueError(f"mesh {mesh.name!r}: cannot bake order {order}; choose 2 to 6 spherical-harmonics bands")
     if threshold is not None and not threshold >= 0:

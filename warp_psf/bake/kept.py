@@ -8,10 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_psf.basis import sh
-from warp_psf.field.shells import COARSEST_RESOLUTION, FINEST_RESOLUTION, SHELL_COUNT, ShadowField
+from warp_psf.field.radiance import RADIANCE_SHELLS, BasisRadianceField
+from warp_psf.field.shells import (
+    COARSEST_RESOLUTION,
+    FINEST_RESOLUTION,
+    FIRST_OUTER_SHELL,
+    SHELL_COUNT,
+    ShadowField,
+)
 from warp_psf.field.store import load_arrays, save_arrays
 from warp_psf.scene.mesh import Mesh
 
+_FIELD_ARRAYS = ("center", "resolutions", "codes", "minimum", "step", "covered")
 RESOLUTIONS = [2**k for k in range(FINEST_RESOLUTION.bit_length()) if 2**k >= COARSEST_RESOLUTION]
 
 
@@ -78,10 +86,8 @@ def _find_wrong(arrays: dict[str, np.ndarray], coefficients: int, vertices: int 
     }
     if vertices is not None:
         layout |= dict.fromkeys(("transfer", "visibility"), (np.float32, (vertices, coefficients)))
-    for name, (dtype, shape) in layout.items():
-        array = arrays.get(name)
-        if array is None or array.dtype != dtype or array.shape != shape or not np.isfinite(array).all():
-            return name
+    if wrong := _find_unlike(arrays, layout):
+        return wrong
     if not np.isin(arrays["resolutions"], RESOLUTIONS).all():
         return "resolutions"
     if not arrays["radius"] > 0:
@@ -91,3 +97,69 @@ def _find_wrong(arrays: dict[str, np.ndarray], coefficients: int, vertices: int 
         return "codes"
     unexpected = arrays.keys() - layout.keys() - {"codes"}
     return min(unexpected) if unexpected else None
+
+
+def save_radiance(
+    key: str, basis: np.ndarray, proxies: np.ndarray, self_irradiance: np.ndarray | None, field: BasisRadianceField
+) -> None:
+    """Keeps what `bake_radiance` computes under a key."""
+    arrays = {"basis": basis, "proxies": proxies, "radius": np.array(field.radius)}
+    arrays |= {name: getattr(field, name) for name in _FIELD_ARRAYS}
+    if self_irradiance is not None:
+        arrays["self_irradiance"] = self_irradiance
+    save_arrays(key, arrays)
+
+
+def load_radiance(
+    key: str, mesh: Mesh, order: int, functions: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, BasisRadianceField] | None:
+    """What `save_radiance` kept under a key, or None when there is none, or (which is said) none that can be used."""
+    arrays = load_arrays(key)
+    if arrays is None:
+        return None
+    if wrong := _find_wrong_radiance(arrays, mesh, sh.coefficient_count(order), functions):
+        message = f"the cached basis radiance of mesh {mesh.name!r} has a wrong {wrong!r}; it is baked again"
+        warnings.warn(message, stacklevel=3)
+        return None
+    field = BasisRadianceField(radius=float(arrays["radius"]), **{name: arrays[name] for name in _FIELD_ARRAYS})
+    return arrays["basis"], arrays["proxies"], arrays.get("self_irradiance"), field
+
+
+def _find_wrong_radiance(arrays: dict[str, np.ndarray], mesh: Mesh, coefficients: int, functions: int) -> str | None:
+    """The name of an array that is not as `save_radiance` writes it, or None."""
+    vertices = len(mesh.vertices)
+    layout: dict[str, tuple[type, tuple[int, ...]]] = {
+        "resolutions": (np.int32, (RADIANCE_SHELLS,)),
+        "center": (np.float32, (3,)),
+        "radius": (np.float64, ()),
+        "minimum": (np.float32, (RADIANCE_SHELLS, functions, coefficients)),
+        "step": (np.float32, (RADIANCE_SHELLS, functions, coefficients)),
+        "basis": (np.float32, (vertices, functions)),
+        "proxies": (np.int32, (arrays["proxies"].size if "proxies" in arrays else 0,)),
+    }
+    if not mesh.convex:
+        layout["self_irradiance"] = (np.float32, (vertices, functions))
+    if wrong := _find_unlike(arrays, layout):
+        return wrong
+    if not np.isin(arrays["resolutions"], RESOLUTIONS).all():
+        return "resolutions"
+    if not arrays["radius"] > 0:
+        return "radius"
+    proxies, counts = arrays["proxies"], arrays["resolutions"].astype(np.int64) ** 2
+    if not proxies.size or not ((proxies >= 0) & (proxies < vertices)).all():
+        return "proxies"
+    codes = {"codes": (np.uint8, (int(counts.sum()), functions, coefficients))}
+    covered = {"covered": (np.float32, (int(counts[FIRST_OUTER_SHELL]),))}
+    if wrong := _find_unlike(arrays, codes | covered):
+        return wrong
+    unexpected = arrays.keys() - layout.keys() - {"codes", "covered"}
+    return min(unexpected) if unexpected else None
+
+
+def _find_unlike(arrays: dict[str, np.ndarray], layout: dict[str, tuple[type, tuple[int, ...]]]) -> str | None:
+    """The name of an array that is missing, not finite, or of another type or shape than laid out, or None."""
+    for name, (dtype, shape) in layout.items():
+        array = arrays.get(name)
+        if array is None or array.dtype != dtype or array.shape != shape or not np.isfinite(array).all():
+            return name
+    return None

@@ -110,6 +110,61 @@ def quantise(center: np.ndarray, radius: float, shells: list[np.ndarray]) -> Sha
     )
 
 
+@wp.func
+def angles_of(offset: wp.vec3, distance: float):
+    """The direction from the centre as theta, in half turns from +z, and phi, in turns from +x (-1/2 to 1/2)."""
+    # From both legs of the angle, because acos has no digits left near the poles; the centre itself has no
+    # direction, and any will do.
+    level = wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1])
+    theta = sphere.angle_of(level, offset[2], distance) * wp.static(1.0 / math.pi)
+    phi = sphere.angle_of(wp.abs(offset[1]), offset[0], level) * wp.static(0.5 / math.pi)
+    return theta, wp.where(offset[1] < 0.0, -phi, phi)
+
+
+@wp.func
+def nearest_four(first: int, resolution: int, theta: float, phi: float):
+    """The samples around a direction on a shell, and their bilinear shares."""
+    # Continuous sample coordinates: sample (s, t) stands at s + 1/2, t + 1/2.
+    row = theta * float(resolution) - 0.5
+    column = phi * float(resolution) - 0.5
+    row_below = int(wp.floor(row))
+    column_below = int(wp.floor(column))
+    u = row - float(row_below)
+    v = column - float(column_below)
+    mask = resolution - 1  # resolutions are powers of two: `& mask` wraps the azimuth, also of -1
+    half = resolution / 2
+    # A row beyond a pole is the same row seen from the other side: half a turn away in azimuth.
+    base_0 = first + wp.max(row_below, 0) * resolution
+    base_1 = first + wp.min(row_below + 1, mask) * resolution
+    column_0 = column_below + wp.where(row_below < 0, half, 0)
+    column_1 = column_below + wp.where(row_below + 1 > mask, half, 0)
+    corners = wp.vec4i(
+        base_0 + (column_0 & mask),
+        base_0 + ((column_0 + 1) & mask),
+        base_1 + (column_1 & mask),
+        base_1 + ((column_1 + 1) & mask),
+    )
+    return corners, wp.vec4((1.0 - u) * (1.0 - v), (1.0 - u) * v, u * (1.0 - v), u * v)
+
+
+@wp.func
+def between_shells(radius: float, count: int):
+    """The inner of the two shells around a radius, and the share of the outer one; `radius` in units of the spacing.
+
+    In these units shell c has radius c + 1; `count` is the number of shells. What lies within the first shell or
+    beyond the last is on it.
+    """
+    clamped = wp.clamp(radius, 1.0, float(count))
+    inner = wp.min(int(clamped) - 1, count - 2)
+    r_0 = float(inner + 1)
+    weight = clamped - r_0
+    if inner >= wp.static(FIRST_OUTER_SHELL):
+        # Linear in 1/r^2, as solid angle falls: exact for what is far away.
+        r_1 = r_0 + 1.0
+        weight = (1.0 - (r_0 * r_0) / (clamped * clamped)) / (1.0 - (r_0 * r_0) / (r_1 * r_1))
+    return inner, weight
+
+
 @cache
 def make_fields(order: int) -> SimpleNamespace:
     """The device side of fields with `order` bands: the struct `FieldTable` and the function `lookup_coverage`.
@@ -144,59 +199,20 @@ def make_fields(order: int) -> SimpleNamespace:
         """The sum of four samples of a shell and four of the next; `minimum` and `step` are those of the field."""
 
     @wp.func
-    def nearest_four(first: int, resolution: int, theta: float, phi: float):
-        """The samples around a direction on a shell, and their bilinear shares."""
-        # Continuous sample coordinates: sample (s, t) stands at s + 1/2, t + 1/2.
-        row = theta * float(resolution) - 0.5
-        column = phi * float(resolution) - 0.5
-        row_below = int(wp.floor(row))
-        column_below = int(wp.floor(column))
-        u = row - float(row_below)
-        v = column - float(column_below)
-        mask = resolution - 1  # resolutions are powers of two: `& mask` wraps the azimuth, also of -1
-        half = resolution / 2
-        # A row beyond a pole is the same row seen from the other side: half a turn away in azimuth.
-        base_0 = first + wp.max(row_below, 0) * resolution
-        base_1 = first + wp.min(row_below + 1, mask) * resolution
-        column_0 = column_below + wp.where(row_below < 0, half, 0)
-        column_1 = column_below + wp.where(row_below + 1 > mask, half, 0)
-        corners = wp.vec4i(
-            base_0 + (column_0 & mask),
-            base_0 + ((column_0 + 1) & mask),
-            base_1 + (column_1 & mask),
-            base_1 + ((column_1 + 1) & mask),
-        )
-        return corners, wp.vec4((1.0 - u) * (1.0 - v), (1.0 - u) * v, u * (1.0 - v), u * v)
-
-    @wp.func
     def lookup_coverage(table: FieldTable, field: int, p_body: wp.vec3) -> vec:
         """The vector at a point of the body's frame: bilinear on the two nearest shells, then between them."""
         offset = p_body - table.center[field]
         distance = wp.length(offset)
-        # From both legs of the angle, because acos has no digits left near the poles; the centre itself has no
-        # direction, and any will do.
-        level = wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1])
-        theta = sphere.angle_of(level, offset[2], distance) * wp.static(1.0 / math.pi)
-        phi = sphere.angle_of(wp.abs(offset[1]), offset[0], level) * wp.static(0.5 / math.pi)
-        phi = wp.where(offset[1] < 0.0, -phi, phi)
-
-        # In units of the spacing, shell c has radius c + 1.
+        theta, phi = angles_of(offset, distance)
         radius = distance / (table.radius[field] * wp.static(SHELL_SPACING))
         last = float(wp.static(SHELL_COUNT))
-        clamped = wp.clamp(radius, 1.0, last)
-        inner = wp.min(int(clamped) - 1, wp.static(SHELL_COUNT - 2))
-        r_0 = float(inner + 1)
+        inner, weight = between_shells(radius, wp.static(SHELL_COUNT))
         near, near_shares = nearest_four(
             table.shell_first[field, inner], table.shell_resolution[field, inner], theta, phi
         )
         far, far_shares = nearest_four(
             table.shell_first[field, inner + 1], table.shell_resolution[field, inner + 1], theta, phi
         )
-        weight = clamped - r_0
-        if inner >= wp.static(FIRST_OUTER_SHELL):
-            # Linear in 1/r^2, as solid angle falls: exact for what is far away.
-            r_1 = r_0 + 1.0
-            weight = (1.0 - (r_0 * r_0) / (clamped * clamped)) / (1.0 - (r_0 * r_0) / (r_1 * r_1))
         if inner == wp.static(FIRST_OUTER_SHELL):
             constant = table.minimum[field, inner][0] + table.step[field, inner][0] * (
                 near_shares[0] * float(table.codes[near[0]][0])
@@ -266,35 +282,66 @@ def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):
 
 def lookup(field: ShadowField, points_body: np.ndarray) -> np.ndarray:
     """The vectors at points of the body's frame [N, 3], float64 [N, coefficients]: the twin of `lookup_coverage`."""
-    offset = np.asarray(points_body, np.float64) - field.center
-    distance = np.linalg.norm(offset, axis=-1)
+    corners = find_corners(field.center, field.radius, field.resolutions, points_body)
+    samples = field.dequantised().astype(np.float64)
+    nearer, farther = corners.blend(samples)
+    weight = corners.contact_weight(HEMISPHERE_SHARE * nearer[:, 0])[:, None]
+    return corners.scale[:, None] * ((1 - weight) * nearer + weight * farther)
+
+
+@dataclass(frozen=True)
+class Corners:
+    """The samples around points, for the lookups on the host.
+
+    inner: the inner of the two shells around each point, int [N]; weight: the share of the outer one, before contact,
+        float64 [N]; scale: the fall-off beyond the last shell, float64 [N].
+    samples: four on the inner shell, four on the outer, int [2, N, 4]; shares: bilinear ones, float64 [2, N, 4].
+    """
+
+    inner: np.ndarray
+    weight: np.ndarray
+    scale: np.ndarray
+    samples: np.ndarray
+    shares: np.ndarray
+
+    def blend(self, values: np.ndarray) -> np.ndarray:
+        """Values of all samples [samples, ...] on the inner and on the outer shell, [2, N, ...]."""
+        return np.einsum("snk,snk...->sn...", self.shares, values[self.samples])
+
+    def contact_weight(self, share: np.ndarray) -> np.ndarray:
+        """The share of the outer shell [N], with the power that `CONTACT_POWER` makes of the covered `share` [N]."""
+        power = 1 - CONTACT_POWER * np.clip(share, 0, 1)
+        return np.where(self.inner == FIRST_OUTER_SHELL, self.weight.clip(0) ** power, self.weight)
+
+
+def find_corners(center: np.ndarray, radius: float, resolutions: np.ndarray, points_body: np.ndarray) -> Corners:
+    """The samples around points of the body's frame [N, 3] in a field of `len(resolutions)` shells."""
+    offset = np.asarray(points_body, np.float64) - center
     theta = np.arctan2(np.hypot(offset[:, 0], offset[:, 1]), offset[:, 2]) / math.pi
     phi = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * math.pi)
-    radius = distance / (SHELL_SPACING * field.radius)
-    clamped = np.clip(radius, 1, SHELL_COUNT)
-    inner = np.minimum(clamped.astype(int) - 1, SHELL_COUNT - 2)
+    last = len(resolutions)
+    radii = np.linalg.norm(offset, axis=-1) / (SHELL_SPACING * radius)
+    clamped = np.clip(radii, 1, last)
+    inner = np.minimum(clamped.astype(int) - 1, last - 2)
     r_0, r_1 = inner + 1.0, inner + 2.0
     outer_weight = (1 - (r_0 / clamped) ** 2) / (1 - (r_0 / r_1) ** 2)
     weight = np.where(inner >= FIRST_OUTER_SHELL, outer_weight, clamped - r_0)
-    scale = (SHELL_COUNT / np.maximum(radius, SHELL_COUNT))[:, None] ** 2
-    samples = field.dequantised().astype(np.float64)
-    first = np.cumsum(field.resolutions**2) - field.resolutions**2
+    scale = (last / np.maximum(radii, last)) ** 2
+    counts = resolutions.astype(np.int64) ** 2
+    first = np.cumsum(counts) - counts
 
-    def on_shell(shell: np.ndarray) -> np.ndarray:
-        resolution = field.resolutions[shell]
+    def on_shell(shell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        resolution = resolutions[shell].astype(np.int64)
         row, column = theta * resolution - 0.5, phi * resolution - 0.5
         row_below, column_below = np.floor(row).astype(int), np.floor(column).astype(int)
-        total = np.zeros((len(points_body), samples.shape[1]))
+        samples, shares = [], []
         for step_row, step_column in ((0, 0), (0, 1), (1, 0), (1, 1)):
             s, t = row_below + step_row, column_below + step_column
             beyond_pole = (s < 0) | (s >= resolution)
             t = (t + np.where(beyond_pole, resolution // 2, 0)) % resolution
-            s = np.clip(s, 0, resolution - 1)
-            share = np.abs(1 - step_row - (row - row_below)) * np.abs(1 - step_column - (column - column_below))
-            total += share[:, None] * samples[first[shell] + s * resolution + t]
-        return total
+            samples.append(first[shell] + np.clip(s, 0, resolution - 1) * resolution + t)
+            shares.append(np.abs(1 - step_row - (row - row_below)) * np.abs(1 - step_column - (column - column_below)))
+        return np.stack(samples, axis=-1), np.stack(shares, axis=-1)
 
-    nearer, farther = on_shell(inner), on_shell(inner + 1)
-    power = 1 - CONTACT_POWER * np.clip(HEMISPHERE_SHARE * nearer[:, 0], 0, 1)
-    weight = np.where(inner == FIRST_OUTER_SHELL, weight.clip(0) ** power, weight)[:, None]
-    return scale * ((1 - weight) * nearer + weight * farther)
+    (near, near_shares), (far, far_shares) = on_shell(inner), on_shell(inner + 1)
+    return Corners(inner, weight, scale, np.stack([near, far]), np.stack([near_shares, far_shares]))

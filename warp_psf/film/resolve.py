@@ -18,6 +18,7 @@ class LayerTable:
 
     color: wp.array2d(dtype=wp.vec3)
     direct: wp.array2d(dtype=wp.vec3)
+    indirect: wp.array2d(dtype=wp.vec3)
     albedo: wp.array2d(dtype=wp.vec3)
     normal: wp.array2d(dtype=wp.vec3)
     depth: wp.array2d(dtype=wp.float32)
@@ -81,6 +82,8 @@ def _resolve_pixels(
     extra: wp.array2d(dtype=wp.int32),  # (world, pixel)
     diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
     glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    indirect_diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    indirect_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
     background: wp.array2d(dtype=wp.vec3),
     layers: LayerTable,
 ):
@@ -91,6 +94,7 @@ def _resolve_pixels(
     start = extra[world, pixel]
     groups = wp.where(start >= 0, wp.static(EXTRA_GROUPS + 1), 1)
     light = wp.vec3()
+    bounced = wp.vec3()
     shine = wp.vec3()
     albedo = wp.vec3()
     normal = wp.vec3()
@@ -101,9 +105,11 @@ def _resolve_pixels(
         if entity >= 0:
             weight = receivers.weight[world, slot]
             reflectance = geometry.albedo[entity]
-            light += weight * (
-                wp.cw_mul(reflectance, diffuse[world, slot]) * wp.static(1.0 / math.pi)
-                + wp.cw_mul(geometry.specular[entity], glossy[world, slot])
+            lobe = geometry.specular[entity]
+            lambert = reflectance * wp.static(1.0 / math.pi)
+            light += weight * (wp.cw_mul(lambert, diffuse[world, slot]) + wp.cw_mul(lobe, glossy[world, slot]))
+            bounced += weight * (
+                wp.cw_mul(lambert, indirect_diffuse[world, slot]) + wp.cw_mul(lobe, indirect_glossy[world, slot])
             )
             emission = geometry.emission[entity]
             if wp.max(emission) > 0.0:
@@ -113,7 +119,8 @@ def _resolve_pixels(
             normal += weight * receivers.normal[world, slot]
             covered += weight
     layers.direct[world, pixel] = light
-    color = light + shine
+    layers.indirect[world, pixel] = bounced
+    color = light + bounced + shine
     if covered < 1.0 - wp.static(0.5 / SAMPLES):
         color += (1.0 - covered) * look_up(background, camera_ray(camera, world, x, y))
     layers.color[world, pixel] = color
@@ -135,7 +142,7 @@ def make_film(worlds: int, width: int, height: int, background: np.ndarray, devi
     """Room for the layers of width x height pixels before a background, radiance float32 [rows, columns, 3]."""
     table = LayerTable()
     shape = (worlds, width * height)
-    for name in ("color", "direct", "albedo", "normal"):
+    for name in ("color", "direct", "indirect", "albedo", "normal"):
         setattr(table, name, wp.zeros(shape, dtype=wp.vec3, device=device))
     table.depth = wp.zeros(shape, dtype=wp.float32, device=device)
     table.segmentation = wp.zeros(shape, dtype=wp.vec2i, device=device)
@@ -143,14 +150,22 @@ def make_film(worlds: int, width: int, height: int, background: np.ndarray, devi
 
 
 def resolve_pixels(
-    film: Film, surfaces: Surfaces, scene: DeviceScene, diffuse: wp.array, glossy: wp.array, device: wp.Device
+    film: Film,
+    surfaces: Surfaces,
+    scene: DeviceScene,
+    direct: tuple[wp.array, wp.array],
+    indirect: tuple[wp.array, wp.array],
+    device: wp.Device,
 ) -> None:
-    """Writes the film's layers from what the surfaces' receivers received, vec3 (world, slot)."""
-    inputs = [scene.geometry, scene.poses, surfaces.camera, surfaces.receivers, surfaces.extra, diffuse, glossy]
+    """Writes the film's layers from what the surfaces' receivers received directly and after bounces.
+
+    direct, indirect: irradiance and radiance through the Phong lobe, vec3 (world, slot) each.
+    """
+    inputs = [scene.geometry, scene.poses, surfaces.camera, surfaces.receivers, surfaces.extra, *direct, *indirect]
     launch(_resolve_pixels, surfaces.extra.shape, [*inputs, film.background, film.layers], [], device)
 
 
-LAYERS = ("color", "direct", "albedo", "normal", "depth", "segmentation")
+LAYERS = ("color", "direct", "indirect", "albedo", "normal", "depth", "segmentation")
 
 
 def read_layers(film: Film, names: tuple[str, ...] = LAYERS, world: int = 0) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Meshes fine enough to be shaded at their vertices."""
+"""Meshes fine enough to carry light at their vertices."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from warp_psf.scene.scene import Scene
 # Light on a large flat body changes over lengths like the bodies that stand on it. Its edges are cut to this share of
 # their median radius: a contact shadow then falls on several vertices.
 EDGE_PER_RADIUS = 1.0 / 4.0
+# What leaves a convex body is followed at vertices this far apart at most, in bounding radii.
+LIGHT_PER_RADIUS = 1.0 / 4.0
 # A mesh gets at most about this many faces, whatever its size: an endless floor stays coarse.
 MOST_FACES = 60_000
 
@@ -28,6 +30,16 @@ def refine_flat_bodies(scene: Scene) -> Scene:
         return scene
     longest = EDGE_PER_RADIUS * float(np.median(radii))
     return dataclasses.replace(scene, meshes=tuple(_refine(mesh, longest) for mesh in scene.meshes))
+
+
+def refine_radiating(mesh: Mesh) -> Mesh:
+    """The mesh finely enough cut for light that varies over it; boxes become meshes like any other.
+
+    Bodies that shadow themselves stay as they are: what is stored of that belongs to their own vertices.
+    """
+    if mesh.slab is None and not mesh.convex:
+        return mesh
+    return tessellate(dataclasses.replace(mesh, slab=None), LIGHT_PER_RADIUS * mesh.radius)
 
 
 def _refine(mesh: Mesh, longest: float) -> Mesh:

@@ -229,7 +229,14 @@ def make_direct(order: int) -> SimpleNamespace:
         diffuse_out[world, receiver] = wp.max(diffuse, zero)
         glossy_out[world, receiver] = wp.max(glossy, zero)
 
-    return SimpleNamespace(**vars(kit), Lighting=Lighting, shade_receivers=shade_receivers)
+    return SimpleNamespace(
+        **vars(kit),
+        Lighting=Lighting,
+        Surface=Surface,
+        surface_of=surface_of,
+        transfer_of=transfer_of,
+        shade_receivers=shade_receivers,
+    )
 
 
 def legendre_series(zonal: np.ndarray) -> np.ndarray:

@@ -25,12 +25,14 @@ from warp_psf.basis import sh, sphere
 def make_directions(order: int) -> SimpleNamespace:
     """Vector types and device functions for `order` bands.
 
-    values: the values at all directions; half_values: at the first half; vec: SH coefficients; profile: zonal ones.
+    values: the values at all directions; half_values: at the first half; rgb_values: those of red, of green and of blue
+    at all directions; vec: SH coefficients; profile: zonal ones.
     Directions come as `quadrature`, three rows of half_values, x, y and z.
     """
     points = sphere.QUADRATURE_POINTS[order]
     values = wp.types.vector(points, wp.float32)
     half_values = wp.types.vector(points // 2, wp.float32)
+    rgb_values = wp.types.vector(3 * points, wp.float32)
     vec = sh.make_sh(order).vec
     # A zonal function may have a band more than the fields, whose vectors are stored.
     profile = wp.types.vector(order + 1, wp.float32)
@@ -47,16 +49,27 @@ def make_directions(order: int) -> SimpleNamespace:
     def zonal_at_directions(coefficients: profile, axis: wp.vec3, quadrature: wp.array(dtype=half_values)) -> values:
         """The values of sum_l c_l P_l(cosine to a unit axis)."""
 
+    @wp.func_native(project_snippet(order * order, points))
+    def project(weighted: values, rows: wp.array(dtype=half_values)) -> vec:
+        """Values times the quadrature's weights -> the SH vector, with the rows y_k at the first half."""
+
+    @wp.func_native(_sum_rgb_snippet(points))
+    def sum_rgb(a: values, rgb: rgb_values) -> wp.vec3:
+        """The dot products with the values of red, green and blue."""
+
     return SimpleNamespace(
         order=order,
         points=points,
         vec=vec,
         values=values,
         half_values=half_values,
+        rgb_values=rgb_values,
         profile=profile,
         sum_of_products=sum_of_products,
         at_directions=at_directions,
         zonal_at_directions=zonal_at_directions,
+        project=project,
+        sum_rgb=sum_rgb,
     )
 
 
@@ -78,15 +91,53 @@ def basis_at_directions(order: int) -> np.ndarray:
 
 
 def _sum_of_products_snippet(points: int) -> str:
-    # Sixteen sums side by side, which a CPU adds at once; a single one would be a chain of additions.
+    return f"{_sum_in_lanes(points, 'a[i + lane] * b[i + lane]')} return sums[0];"
+
+
+def _sum_in_lanes(count: int, product: str) -> str:
+    """C++ that leaves the sum over `i + lane` in sums[0].
+
+    Sums side by side are added at once by a CPU; a single one would be a chain of additions.
+    """
+    lanes = 16 if count % 16 == 0 else 8
     return f"""
-    float sums[16];
-    for (int lane = 0; lane < 16; ++lane) sums[lane] = 0.0f;
-    for (int i = 0; i < {points}; i += 16)
-        for (int lane = 0; lane < 16; ++lane) sums[lane] += a[i + lane] * b[i + lane];
-    for (int width = 8; width > 0; width /= 2)
+    float sums[{lanes}];
+    for (int lane = 0; lane < {lanes}; ++lane) sums[lane] = 0.0f;
+    for (int i = 0; i < {count}; i += {lanes})
+        for (int lane = 0; lane < {lanes}; ++lane) sums[lane] += {product};
+    for (int width = {lanes // 2}; width > 0; width /= 2)
         for (int lane = 0; lane < width; ++lane) sums[lane] += sums[width + lane];
-    return sums[0];
+    """
+
+
+def _sum_rgb_snippet(points: int) -> str:
+    summed = _sum_in_lanes(points, f"a[i + lane] * rgb[channel * {points} + i + lane]")
+    return f"""
+    wp::vec_t<3, float> result;
+    for (int channel = 0; channel < 3; ++channel) {{ {summed} result[channel] = sums[0]; }}
+    return result;
+    """
+
+
+def project_snippet(coefficients: int, points: int) -> str:
+    half = points // 2
+    parts = {
+        parity: _sum_in_lanes(half, f"{parity}[i + lane] * rows.data[k][i + lane]") + "result[k] = sums[0];"
+        for parity in ("even", "odd")
+    }
+    odd = ", ".join("true" if math.isqrt(k) % 2 else "false" for k in range(coefficients))
+    return f"""
+    const bool is_odd[{coefficients}] = {{{odd}}};
+    float even[{half}], odd[{half}];
+    for (int i = 0; i < {half}; ++i) {{
+        even[i] = weighted[i] + weighted[{half} + i];
+        odd[i] = weighted[i] - weighted[{half} + i];
+    }}
+    wp::vec_t<{coefficients}, float> result;
+    for (int k = 0; k < {coefficients}; ++k) {{
+        if (is_odd[k]) {{ {parts["odd"]} }} else {{ {parts["even"]} }}
+    }}
+    return result;
     """
 
 

@@ -195,6 +195,7 @@ def make_occlude(order: int) -> SimpleNamespace:
         **vars(kit),
         Occlusion=Occlusion,
         covered_by=covered_by,
+        matters=matters,
         visibility_at=visibility_at,
         turn_basis=turn_basis,
     )

@@ -1,0 +1,512 @@
+"""Interreflection: light that bodies send to one another, several times (Iwasaki 2007, sections 3 and 5).
+
+The light that leaves the bodies is followed at proxies: chosen vertices of bodies, and the texels of slabs. Per frame:
+
+1. Basis irradiances: what each proxy receives of every basis function of every body around it, past what stands
+   between, and of every face of a slab as the values that its radiance is to be multiplied with. They depend on poses
+   alone and are kept for as long as nothing moves.
+2. The light that leaves the proxies after direct light, as weights of the basis functions and as texels.
+3. Bounces: the proxies' new light is a sum of products of what is kept with the weights, and gives new weights.
+4. The sum over all bounces but the last, as weights and texels, is what a last gather at pixels shows.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_psf.device import launch
+from warp_psf.field.radiance import BasisRadianceField, SummedFields, make_radiance, make_summed, upload_radiance
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.receiver import ReceiverTable, make_receivers
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.between import MOST_SOURCES, hides_face, make_between
+from warp_psf.shade.direct import DirectState, make_direct
+from warp_psf.shade.occlude import OcclusionState
+from warp_psf.shade.patches import (
+    Patches,
+    PatchTable,
+    build_pyramids,
+    make_patches,
+    place_texels,
+    slab_from_world,
+    slab_origin,
+    upload_patches,
+)
+
+# Proxies of one body, and of all bodies together: where there are many bodies, each gets fewer.
+MOST_PROXIES_PER_BODY = 192
+FEWEST_PROXIES_PER_BODY = 48
+MOST_PROXIES = 6144
+# Faces of slabs that a proxy keeps values of: three sides of a box can be seen at once.
+MOST_FACES = 24
+
+
+class Radiating(Protocol):
+    """What is baked of a body that sends out light; see `warp_psf.bake.radiance`."""
+
+    field: BasisRadianceField
+    proxies: np.ndarray
+    self_irradiance: np.ndarray | None
+
+    def solver(self, count: int) -> np.ndarray: ...
+
+
+@cache
+def make_bounce(order: int, functions: int) -> SimpleNamespace:
+    """The kernels and tables of the bounces on `order` bands with `functions` basis functions per body."""
+    kit = make_direct(order)
+    between = make_between(order)
+    patch = make_patches(order)
+    radiant = make_radiance(order, functions)
+    values = kit.values
+    per_function = radiant.weights
+    Occlusion, Lighting, RadianceTable = kit.Occlusion, kit.Lighting, radiant.RadianceTable
+
+    @wp.struct
+    class BodyTable:
+        """The bodies that send out light through basis functions."""
+
+        field: wp.array(dtype=wp.int32)  # (entity): its basis radiance field, -1 for slabs and lights
+        first_proxy: wp.array(dtype=wp.int32)  # (entity)
+        proxies: wp.array(dtype=wp.int32)  # (entity): how many
+        first_solver: wp.array(dtype=wp.int32)  # (entity): its first number in `solver`
+        solver: wp.array(dtype=wp.float32)  # per body (function, proxy), Iwasaki 2007, section 5.2
+        own: wp.array(dtype=per_function)  # (body proxy): irradiance there that the body's own functions cause
+        weights: wp.array3d(dtype=per_function)  # (world, entity, channel)
+
+    @wp.struct
+    class KeptTable:
+        """What the proxies receive per unit of light, kept for as long as nothing moves."""
+
+        count: wp.array2d(dtype=wp.int32)  # (world, proxy)
+        entity: wp.array3d(dtype=wp.int32)  # (world, proxy, place)
+        irradiance: wp.array3d(dtype=per_function)  # (world, proxy, place): basis irradiances
+        face_count: wp.array2d(dtype=wp.int32)  # (world, proxy)
+        face: wp.array3d(dtype=wp.int32)  # (world, proxy, place)
+        # (world, proxy, place): what the radiance of the face at the directions is to be multiplied with
+        transport: wp.array3d(dtype=values)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def gather_basis(
+        first: int,
+        proxies: ReceiverTable,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+        lighting: Lighting,
+        patches: PatchTable,
+        fields: RadianceTable,
+        bodies: BodyTable,
+        threshold: float,
+        kept: KeptTable,
+    ):
+        world, proxy = wp.tid()
+        proxy += first
+        own = proxies.entity[world, proxy]
+        if own < 0:
+            return
+        surface = kit.surface_of(world, proxy, proxies, geometry, poses, lighting)
+        p = surface.position
+        transfer = kit.transfer_of(surface, o.rows[world, own], lighting, o)
+        transfer = wp.cw_mul(transfer, lighting.weights[0])
+        sources = between.find_sources(world, own, p, surface.normal, threshold, geometry, poses, patches, o)
+        covers = between.lists()
+        for place in range(sources.count):
+            covered = kit.covered_by(world, sources.entity[place], p, geometry, poses, o)
+            covers[place] = sources.weight[place] * covered
+        count = int(0)
+        faces = int(0)
+        for place in range(sources.count):
+            source = sources.entity[place]
+            weighted = sources.weight[place] * transfer
+            if bodies.field[source] >= 0:
+                passed = values(1.0)
+                for other in range(sources.count):
+                    if other != place:
+                        share = between.hides_body(world, sources, other, place, p, geometry, poses, patches)
+                        if share > 0.0:
+                            passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+                p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
+                where = radiant.locate(fields, bodies.field[source], p_body)
+                received = kit.project(wp.cw_mul(passed, weighted), o.rows[world, source])
+                kept.entity[world, proxy, count] = source
+                kept.irradiance[world, proxy, count] = radiant.basis_irradiance(fields, where, received)
+                count += 1
+            elif patches.first_face[source] >= 0:
+                to_slab = slab_from_world(world, source, poses, patches)
+                p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
+                for side in range(6):
+                    face = patches.first_face[source] + side
+                    if patch.sees_face(world, face, p_slab, patches) and faces < kept.face.shape[2]:
+                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o.quadrature)
+                        for other in range(sources.count):
+                            if other != place:
+                                share = hides_face(world, sources.entity[other], face, p, geometry, poses, patches)
+                                if share > 0.0:
+                                    passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+                        kept.face[world, proxy, faces] = face
+                        kept.transport[world, proxy, faces] = wp.cw_mul(passed, weighted)
+                        faces += 1
+        kept.count[world, proxy] = count
+        kept.face_count[world, proxy] = faces
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def leave_surface(
+        first: int,
+        proxies: ReceiverTable,
+        geometry: GeometryTable,
+        irradiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+        radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+        total_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+    ):
+        world, proxy = wp.tid()
+        proxy += first
+        entity = proxies.entity[world, proxy]
+        radiance = wp.vec3()
+        if entity >= 0:
+            reflectance = geometry.albedo[entity] + geometry.specular[entity]
+            radiance = geometry.emission[entity] + wp.cw_mul(reflectance, irradiance[world, proxy]) / wp.pi
+        radiance_out[world, proxy] = radiance
+        total_out[world, proxy] = radiance
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def bounce_light(
+        first: int,
+        proxies: ReceiverTable,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+        patches: PatchTable,
+        bodies: BodyTable,
+        kept: KeptTable,
+        radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+        total_out: wp.array2d(dtype=wp.vec3),  # (world, proxy), added to
+    ):
+        world, proxy = wp.tid()
+        proxy += first
+        own = proxies.entity[world, proxy]
+        if own < 0:
+            return
+        irradiance = wp.vec3()
+        for place in range(kept.count[world, proxy]):
+            received = kept.irradiance[world, proxy, place]
+            source = kept.entity[world, proxy, place]
+            irradiance += wp.vec3(
+                wp.dot(received, bodies.weights[world, source, 0]),
+                wp.dot(received, bodies.weights[world, source, 1]),
+                wp.dot(received, bodies.weights[world, source, 2]),
+            )
+        for place in range(kept.face_count[world, proxy]):
+            face = kept.face[world, proxy, place]
+            slab = patches.entity[face]
+            to_slab = slab_from_world(world, slab, poses, patches)
+            p_slab = to_slab * (proxies.position[world, proxy] - slab_origin(world, slab, poses, patches))
+            shown = patch.face_radiance(world, face, p_slab, to_slab, patches, o.quadrature)
+            irradiance += kit.sum_rgb(kept.transport[world, proxy, place], shown)
+        if bodies.field[own] >= 0:
+            from_itself = bodies.own[proxy]
+            irradiance += wp.vec3(
+                wp.dot(from_itself, bodies.weights[world, own, 0]),
+                wp.dot(from_itself, bodies.weights[world, own, 1]),
+                wp.dot(from_itself, bodies.weights[world, own, 2]),
+            )
+        reflectance = geometry.albedo[own] + geometry.specular[own]
+        radiance = wp.cw_mul(reflectance, wp.max(irradiance, wp.vec3())) / wp.pi
+        radiance_out[world, proxy] = radiance
+        total_out[world, proxy] = total_out[world, proxy] + radiance
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def solve_weights(
+        first: int,
+        bodies: BodyTable,
+        radiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+        weights_out: wp.array4d(dtype=wp.float32),  # (world, entity, channel, function)
+        weights_rgb_out: wp.array3d(dtype=wp.vec3),  # (world, entity, function): the same
+    ):
+        world, item = wp.tid()
+        item += first
+        entity = item / wp.static(functions)
+        function = item % wp.static(functions)
+        if bodies.field[entity] < 0:
+            return
+        count = bodies.proxies[entity]
+        start = bodies.first_proxy[entity]
+        row = bodies.first_solver[entity] + function * count
+        total = wp.vec3()
+        for proxy in range(count):
+            total += bodies.solver[row + proxy] * radiance[world, start + proxy]
+        for channel in range(3):
+            weights_out[world, entity, channel, function] = total[channel]
+        weights_rgb_out[world, entity, function] = total
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def light_itself(
+        first: int,
+        bodies: BodyTable,
+        entities: wp.array(dtype=wp.int32),  # (own vertex): entity
+        rows: wp.array(dtype=wp.int32),  # (own vertex): row of `functions`
+        own_functions: wp.array(dtype=per_function),
+        light_out: wp.array2d(dtype=wp.vec3),  # (world, own vertex)
+    ):
+        world, vertex = wp.tid()
+        vertex += first
+        entity = entities[vertex]
+        from_itself = own_functions[rows[vertex]]
+        light_out[world, vertex] = wp.vec3(
+            wp.dot(from_itself, bodies.weights[world, entity, 0]),
+            wp.dot(from_itself, bodies.weights[world, entity, 1]),
+            wp.dot(from_itself, bodies.weights[world, entity, 2]),
+        )
+
+    return SimpleNamespace(
+        **vars(kit),
+        radiant=radiant,
+        between=between,
+        patch=patch,
+        BodyTable=BodyTable,
+        KeptTable=KeptTable,
+        gather_basis=gather_basis,
+        leave_surface=leave_surface,
+        bounce_light=bounce_light,
+        solve_weights=solve_weights,
+        light_itself=light_itself,
+    )
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _place_proxies(
+    first: int,
+    poses: PoseTable,
+    entities: wp.array(dtype=wp.int32),  # (body proxy)
+    points: wp.array(dtype=wp.vec3),  # (body proxy), in the entity's frame
+    normals: wp.array(dtype=wp.vec3),  # (body proxy)
+    proxies: ReceiverTable,
+):
+    world, proxy = wp.tid()
+    proxy += first
+    entity = entities[proxy]
+    rotation = poses.rotation[world, entity]
+    proxies.entity[world, proxy] = entity
+    proxies.position[world, proxy] = poses.position[world, entity] + rotation * points[proxy]
+    proxies.normal[world, proxy] = rotation * normals[proxy]
+
+
+@dataclass(frozen=True)
+class BounceState:
+    """The proxies of a scene with all that their light needs; the bodies' proxies come first, then the texels."""
+
+    order: int
+    functions: int
+    proxies: ReceiverTable
+    body_entities: wp.array
+    body_points: wp.array
+    body_normals: wp.array
+    bodies: Any  # make_bounce(order, functions).BodyTable
+    kept: Any  # make_bounce(order, functions).KeptTable
+    fields: Any  # make_radiance(order, functions).RadianceTable
+    patches: Patches
+    weights: wp.array  # the memory behind bodies.weights, float32 (world, entity, channel, function)
+    weights_rgb: wp.array  # the same, vec3 (world, entity, function)
+    summed: SummedFields
+    own_first: wp.array  # (entity): its first own vertex, -1 for bodies that send nothing to themselves
+    own_entities: wp.array  # (own vertex)
+    own_rows: wp.array  # (own vertex): row of own_functions, which entities of one mesh share
+    own_functions: wp.array
+    own_light: wp.array  # vec3 (world, own vertex): irradiance there from the body itself
+    turns: wp.array  # all 1: every proxy is shaded
+    received: tuple[wp.array, wp.array]  # irradiance and Phong radiance of direct light
+    radiance: wp.array  # vec3 (world, proxy): the light that leaves after the last bounce
+    total: wp.array  # vec3 (world, proxy): and after all bounces so far
+
+    @property
+    def first_texel(self) -> int:
+        """The proxy that is the first texel."""
+        return self.body_entities.shape[0]
+
+
+def upload_bounces(
+    scene: Scene,
+    radiating: list[tuple[Mesh, Radiating] | None],
+    is_patch: list[bool],
+    occlusion: OcclusionState,
+    functions: int,
+    worlds: int,
+    device: wp.Device,
+) -> BounceState:
+    """Everything about bounces that does not change from frame to frame, with room for what does.
+
+    radiating: per entity the mesh whose vertices carry its basis functions, and what was baked of it; None for slabs
+    that are patches, and for lights. is_patch: per entity.
+    """
+    order = occlusion.order
+    kit = make_bounce(order, functions)
+    chosen = [entity for entity, pair in enumerate(radiating) if pair is not None]
+    fields = list({id(pair[1].field): pair[1].field for pair in radiating if pair is not None}.values())
+    number = {id(field): index for index, field in enumerate(fields)}
+    share = int(np.clip(MOST_PROXIES // max(len(chosen), 1), FEWEST_PROXIES_PER_BODY, MOST_PROXIES_PER_BODY))
+
+    field_of, counts, starts, solver_starts = (np.full(len(radiating), -1, np.int64) for _ in range(4))
+    points, normals, faces, corners, solvers, own, total, solved = [], [], [], [], [], [], 0, 0
+    for entity in chosen:
+        mesh, baked = radiating[entity]
+        vertices = baked.proxies[:share]
+        field_of[entity], counts[entity] = number[id(baked.field)], len(vertices)
+        starts[entity], solver_starts[entity] = total, solved
+        total, solved = total + len(vertices), solved + functions * len(vertices)
+        points.append(mesh.vertices[vertices])
+        normals.append(mesh.normals[vertices])
+        face_of, corner_of = _faces_of(mesh)
+        faces.append(face_of[vertices])
+        corners.append(corner_of[vertices])
+        solvers.append(baked.solver(len(vertices)).ravel())
+        from_itself = baked.self_irradiance
+        own.append(np.zeros((len(vertices), functions)) if from_itself is None else from_itself[vertices])
+
+    def upload(values, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=device)
+
+    def stack(parts: list, columns: int) -> np.ndarray:
+        return np.concatenate([np.zeros((0, columns), np.float32), *parts]).astype(np.float32)
+
+    bodies = kit.BodyTable()
+    bodies.field, bodies.proxies = upload(field_of, wp.int32), upload(counts, wp.int32)
+    bodies.first_proxy, bodies.first_solver = upload(starts, wp.int32), upload(solver_starts, wp.int32)
+    bodies.solver = upload(np.concatenate([np.zeros(1, np.float32)[:0], *solvers]), wp.float32)
+    bodies.own = upload(stack(own, functions), kit.radiant.weights)
+    shape = (worlds, len(radiating), 3)
+    weights = wp.zeros((*shape, functions), dtype=wp.float32, device=device)
+    bodies.weights = wp.array(ptr=weights.ptr, dtype=kit.radiant.weights, shape=shape, device=device, copy=False)
+
+    patches = upload_patches(scene, is_patch, occlusion, worlds, device)
+    slots = total + patches.texels
+    proxies = make_receivers((worlds, slots), device)
+    proxies.entity.fill_(-1)
+    face = np.concatenate([np.zeros(0, np.int32), *faces, np.zeros(patches.texels, np.int32)])
+    corner = np.concatenate([np.zeros(0, np.int32), *corners, np.zeros(patches.texels, np.int32)])
+    proxies.face.assign(np.repeat(face[None], worlds, axis=0).astype(np.int32))
+    uv = np.stack([corner == 0, corner == 1], axis=1).astype(np.float32)
+    proxies.uv.assign(np.repeat(uv[None], worlds, axis=0))
+    return BounceState(
+        order,
+        functions,
+        proxies,
+        upload(np.repeat(chosen, counts[chosen]) if chosen else np.zeros(0), wp.int32),
+        upload(stack(points, 3), wp.vec3),
+        upload(stack(normals, 3), wp.vec3),
+        bodies,
+        _make_kept(kit, worlds, slots, len(chosen), sum(is_patch), device),
+        upload_radiance(fields, order, functions, device),
+        patches,
+        weights,
+        wp.zeros((worlds, len(radiating), functions), dtype=wp.vec3, device=device),
+        make_summed([int(field) for field in field_of], fields, order, functions, worlds, device),
+        *_upload_own(radiating, functions, worlds, device),
+        wp.full((worlds, slots), 1, dtype=wp.int32, device=device),
+        tuple(wp.zeros((worlds, slots), dtype=wp.vec3, device=device) for _ in range(2)),
+        wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
+        wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
+    )
+
+
+def gather_basis_irradiances(
+    state: BounceState,
+    scene: DeviceScene,
+    occlusion: OcclusionState,
+    lighting: DirectState,
+    threshold: float,
+    device: wp.Device,
+) -> None:
+    """Places the proxies and gathers what each receives of every function and face; once per change of poses.
+
+    threshold: bodies that take up a smaller share of a proxy's view than this are skipped (section 5.4).
+    """
+    kit = make_bounce(state.order, state.functions)
+    worlds = state.turns.shape[0]
+    inputs = [scene.poses, state.body_entities, state.body_points, state.body_normals, state.proxies]
+    launch(_place_proxies, (worlds, state.first_texel), inputs, [], device)
+    place_texels(state.patches, scene, state.proxies, state.first_texel, device)
+    tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.fields]
+    inputs = [state.proxies, *tables, state.bodies, threshold]
+    launch(kit.gather_basis, state.turns.shape, inputs, [state.kept], device)
+
+
+def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, times: int, device: wp.Device) -> None:
+    """Lets the direct light of the proxies, `state.received`, bounce, for what a last gather brings in bounce `times`.
+
+    Leaves the sum over all bounces in the weights and the texels.
+    """
+    kit = make_bounce(state.order, state.functions)
+    shape, patches = state.turns.shape, state.patches
+    outputs = [state.radiance, state.total]
+    launch(kit.leave_surface, shape, [state.proxies, scene.geometry, state.received[0]], outputs, device)
+    for _ in range(times - 1):
+        _represent(state, state.radiance, device)
+        inputs = [state.proxies, scene.geometry, scene.poses, occlusion.table, patches.table, state.bodies, state.kept]
+        launch(kit.bounce_light, shape, inputs, outputs, device)
+    _represent(state, state.total, device)
+    inputs = [state.bodies, state.own_entities, state.own_rows, state.own_functions]
+    launch(kit.light_itself, state.own_light.shape, inputs, [state.own_light], device)
+
+
+def _represent(state: BounceState, radiance: wp.array, device: wp.Device) -> None:
+    """Turns the proxies' light into weights and texels."""
+    kit = make_bounce(state.order, state.functions)
+    worlds, entities = state.weights.shape[:2]
+    dim = (worlds, entities * state.functions)
+    launch(kit.solve_weights, dim, [state.bodies, radiance], [state.weights, state.weights_rgb], device)
+    build_pyramids(state.patches, radiance, state.first_texel, device)
+
+
+def _upload_own(radiating: list, functions: int, worlds: int, device: wp.Device) -> tuple[wp.array, ...]:
+    """The vertices of bodies that send light to themselves: own_first, _entities, _rows, _functions and _light."""
+    first, entities, rows, tables = [], [], [], []
+    start_of: dict[int, int] = {}
+    total = stored = 0
+    for entity, pair in enumerate(radiating):
+        own = None if pair is None else pair[1].self_irradiance
+        first.append(-1 if own is None else total)
+        if own is None:
+            continue
+        if id(own) not in start_of:
+            start_of[id(own)] = stored
+            tables.append(own)
+            stored += len(own)
+        entities.append(np.full(len(own), entity))
+        rows.append(start_of[id(own)] + np.arange(len(own)))
+        total += len(own)
+    empty = np.zeros(0, np.int32)
+    weights = wp.types.vector(functions, wp.float32)
+    table = np.concatenate([np.zeros((0, functions), np.float32), *tables])
+    return (
+        wp.array(first, dtype=wp.int32, device=device),
+        wp.array(np.concatenate([empty, *entities]), dtype=wp.int32, device=device),
+        wp.array(np.concatenate([empty, *rows]), dtype=wp.int32, device=device),
+        wp.array(table, dtype=weights, device=device),
+        wp.zeros((worlds, total), dtype=wp.vec3, device=device),
+    )
+
+
+def _make_kept(kit: SimpleNamespace, worlds: int, slots: int, bodies: int, slabs: int, device: wp.Device):
+    places, faces = min(MOST_SOURCES, bodies), min(MOST_FACES, 3 * slabs)
+    kept = kit.KeptTable()
+    kept.count = wp.zeros((worlds, slots), dtype=wp.int32, device=device)
+    kept.entity = wp.zeros((worlds, slots, places), dtype=wp.int32, device=device)
+    kept.irradiance = wp.zeros((worlds, slots, places), dtype=kit.radiant.weights, device=device)
+    kept.face_count = wp.zeros((worlds, slots), dtype=wp.int32, device=device)
+    kept.face = wp.zeros((worlds, slots, faces), dtype=wp.int32, device=device)
+    kept.transport = wp.zeros((worlds, slots, faces), dtype=kit.values, device=device)
+    return kept
+
+
+def _faces_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """For every vertex one face that has it, and as which corner. The last face written wins; any will do."""
+    face_of, corner_of = np.zeros((2, len(mesh.vertices)), np.int32)
+    for corner in range(3):
+        face_of[mesh.faces[:, corner]] = np.arange(len(mesh.faces))
+        corner_of[mesh.faces[:, corner]] = corner
+    return face_of, corner_of

@@ -1,0 +1,223 @@
+"""Incident light: what arrives at a point from the bodies around it, as SH vectors.
+
+Here the basis radiance fields have been summed with the weights of the frame, so that one lookup per colour channel
+brings a body's light; the radiance of slabs comes from their texels. What stands between is composed as for the
+proxies. The result is not yet multiplied with what a surface makes of it: neighbours with other normals share it.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis import sh, sphere
+from warp_psf.scene.geometry import GeometryTable, PoseTable
+from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.shade.between import hides_face
+from warp_psf.shade.bounce import make_bounce
+from warp_psf.shade.directions import make_directions, project_snippet
+from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
+
+
+def wide_order(order: int) -> int:
+    """Bands of the incident light: a product has more than its factors, and the clamped cosine one to receive them."""
+    return min(order + 1, 6)
+
+
+@cache
+def make_incident(order: int, functions: int) -> SimpleNamespace:
+    """The kernels of the last gather on `order` bands with `functions` basis functions per body."""
+    kit = make_bounce(order, functions)
+    between, patch, radiant = kit.between, kit.patch, kit.radiant
+    vec, values, half_values = kit.vec, kit.values, kit.half_values
+    Occlusion, Lighting, Surface = kit.Occlusion, kit.Lighting, kit.Surface
+    bands = wide_order(order)
+    wide = sh.make_sh(bands).vec
+    evaluate_wide = sh.make_sh(bands).evaluate
+    cosine = sh.clamped_cosine(bands) * np.sqrt(4 * np.pi / (2 * np.arange(bands) + 1))
+    cosine = wide(*np.repeat(cosine, 2 * np.arange(bands) + 1))
+
+    @wp.func_native(project_snippet(bands * bands, kit.points))
+    def project_wide(weighted: values, rows: wp.array(dtype=half_values)) -> wide: ...
+
+    @wp.func_native(_widen_snippet(order, bands))
+    def widen(v: vec) -> wide: ...
+
+    @wp.func_native(_channel_snippet(order))
+    def channel_of(rgb: radiant.rgb, channel: int) -> vec: ...
+
+    @wp.func_native(_add_products_snippet(kit.points))
+    def add_products(sum: kit.rgb_values, rgb: kit.rgb_values, passed: values) -> kit.rgb_values: ...
+
+    @wp.func_native(_weigh_channel_snippet(kit.points))
+    def weigh_channel(rgb: kit.rgb_values, channel: int, weights: values) -> values: ...
+
+    @wp.func_native(_join_snippet(kit.points))
+    def join(red: values, green: values, blue: values) -> kit.rgb_values: ...
+
+    @wp.func
+    def to_sh(
+        world: int,
+        entity: int,
+        weighted: values,
+        o: Occlusion,
+        lighting: Lighting,
+        wide_rows: wp.array(dtype=half_values),
+    ) -> wide:
+        """Onto SH: about the axes of a body that shadows itself, as its stored transfer is; else about the world's."""
+        if lighting.first_transfer[entity] >= 0:
+            return widen(kit.project(weighted, o.rows[world, entity]))
+        return project_wide(weighted, wide_rows)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def gather_incident(
+        first: int,
+        start: int,
+        probe_slot: wp.array(dtype=wp.int32),  # (probe): world * slots + slot
+        receivers: ReceiverTable,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        o: Occlusion,
+        lighting: Lighting,
+        patches: PatchTable,
+        fields: radiant.RadianceTable,
+        bodies: kit.BodyTable,
+        summed: wp.array2d(dtype=radiant.rgb),  # (world, entity's sample)
+        summed_first: wp.array(dtype=wp.int32),  # (entity)
+        wide_rows: wp.array(dtype=half_values),
+        threshold: float,
+        light_out: wp.array2d(dtype=wide),  # (probe, channel)
+    ):
+        _world, item = wp.tid()
+        probe = start + first + item
+        slots = receivers.entity.shape[1]
+        world = probe_slot[probe] / slots
+        slot = probe_slot[probe] % slots
+        own = receivers.entity[world, slot]
+        p = receivers.position[world, slot]
+        n = receivers.normal[world, slot]
+        sources = between.find_sources(world, own, p, n, threshold, geometry, poses, patches, o)
+        covers = between.lists()
+        for place in range(sources.count):
+            covered = kit.covered_by(world, sources.entity[place], p, geometry, poses, o)
+            covers[place] = sources.weight[place] * covered
+        incident = kit.rgb_values()
+        for place in range(sources.count):
+            source = sources.entity[place]
+            if bodies.field[source] >= 0:
+                passed = values(sources.weight[place])
+                for other in range(sources.count):
+                    if other != place:
+                        share = between.hides_body(world, sources, other, place, p, geometry, poses, patches)
+                        if share > 0.0:
+                            passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+                p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
+                where = radiant.locate(fields, bodies.field[source], p_body)
+                rgb = radiant.lookup_summed(summed[world], summed_first[source], where)
+                rows = o.rows[world, source]
+                radiance = join(
+                    kit.at_directions(channel_of(rgb, 0), rows),
+                    kit.at_directions(channel_of(rgb, 1), rows),
+                    kit.at_directions(channel_of(rgb, 2), rows),
+                )
+                incident = add_products(incident, radiance, passed)
+            elif patches.first_face[source] >= 0:
+                to_slab = slab_from_world(world, source, poses, patches)
+                p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
+                for side in range(6):
+                    face = patches.first_face[source] + side
+                    if patch.sees_face(world, face, p_slab, patches):
+                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o.quadrature)
+                        passed = sources.weight[place] * passed
+                        for other in range(sources.count):
+                            if other != place:
+                                share = hides_face(world, sources.entity[other], face, p, geometry, poses, patches)
+                                if share > 0.0:
+                                    passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+                        radiance = patch.face_radiance(world, face, p_slab, to_slab, patches, o.quadrature)
+                        incident = add_products(incident, radiance, passed)
+        for channel in range(3):
+            weighted = weigh_channel(incident, channel, lighting.weights[0])
+            light_out[probe, channel] = to_sh(world, own, weighted, o, lighting, wide_rows)
+
+    @wp.func
+    def stored_transfer(surface: Surface, lighting: Lighting) -> vec:
+        start = surface.first_transfer
+        return (
+            surface.uv[0] * lighting.transfer[start + surface.corners[0]]
+            + surface.uv[1] * lighting.transfer[start + surface.corners[1]]
+            + (1.0 - surface.uv[0] - surface.uv[1]) * lighting.transfer[start + surface.corners[2]]
+        )
+
+    @wp.func
+    def response_of(world: int, surface: Surface, poses: PoseTable, lighting: Lighting) -> wide:
+        """What incident light is to be multiplied with to give irradiance."""
+        if surface.first_transfer >= 0:
+            return widen(stored_transfer(surface, lighting))
+        n = surface.normal
+        if lighting.first_transfer[surface.entity] >= 0:
+            n = wp.transpose(poses.rotation[world, surface.entity]) * n
+        return wp.cw_mul(wp.static(cosine), evaluate_wide(n))
+
+    return SimpleNamespace(
+        **vars(kit),
+        wide=wide,
+        to_sh=to_sh,
+        response_of=response_of,
+        gather_incident=gather_incident,
+    )
+
+
+def wide_rows(order: int, device: wp.Device) -> wp.array:
+    """The basis of the incident light at the first half of the directions, about the world's axes."""
+    points = sphere.QUADRATURE_POINTS[order]
+    basis = sh.evaluate(sphere.quadrature(points)[0][: points // 2], wide_order(order))
+    return wp.array(basis.T.astype(np.float32), dtype=make_directions(order).half_values, device=device)
+
+
+def _widen_snippet(order: int, bands: int) -> str:
+    return f"""
+    wp::vec_t<{bands * bands}, float> wide;
+    for (int k = 0; k < {order * order}; ++k) wide[k] = v[k];
+    return wide;
+    """
+
+
+def _channel_snippet(order: int) -> str:
+    return f"""
+    wp::vec_t<{order * order}, float> one;
+    for (int k = 0; k < {order * order}; ++k) one[k] = rgb[channel * {order * order} + k];
+    return one;
+    """
+
+
+def _add_products_snippet(points: int) -> str:
+    return f"""
+    wp::vec_t<{3 * points}, float> result;
+    for (int channel = 0; channel < 3; ++channel)
+        for (int i = 0; i < {points}; ++i)
+            result[channel * {points} + i] =
+                sum[channel * {points} + i] + rgb[channel * {points} + i] * passed[i];
+    return result;
+    """
+
+
+def _weigh_channel_snippet(points: int) -> str:
+    return f"""
+    wp::vec_t<{points}, float> result;
+    for (int i = 0; i < {points}; ++i) result[i] = rgb[channel * {points} + i] * weights[i];
+    return result;
+    """
+
+
+def _join_snippet(points: int) -> str:
+    return f"""
+    wp::vec_t<{3 * points}, float> all;
+    for (int i = 0; i < {points}; ++i) {{
+        all[i] = red[i];
+        all[{points} + i] = green[i];
+        all[{2 * points} + i] = blue[i];
+    }}
+    return all;
+    """

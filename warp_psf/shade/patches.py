@@ -1,0 +1,540 @@
+"""Light that leaves flat things: floors, walls and boxes as textures of radiance, one for each face.
+
+Shells around the centre of a large flat body serve badly the receivers that lie on it, so slabs (`Mesh.slab`) have no
+basis radiance fields. Each of their faces carries a grid of texels instead, finest where the other bodies are. What a
+point receives from a face is the face's coverage, in closed form, times the radiance that the texels show in each
+direction, filtered as coarsely as band-limited functions see it.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.device import launch
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.coverage import make_coverage
+from warp_psf.shade.occlude import OcclusionState
+
+# Texels along the longest side of a slab, and of all slabs together; the smallest slabs give some up first.
+MOST_TEXELS_PER_SIDE = 32
+MOST_TEXELS = 12288
+# However short a side is, it gets two texels: light falls off towards edges.
+FEWEST_TEXELS_PER_SIDE = 2
+# A point closer to a face than this share of the slab's half-diagonal sees it from this height: bodies that touch it
+# sink in a little, and from the plane itself a face is not seen.
+LOWEST_HEIGHT = 1.0e-4
+# Bodies that rise above a face by less than this share of the slab's half-diagonal do not see it.
+FACE_HORIZON = 1.0e-5
+# A slab encloses the end of a face when it reaches to within this share of the other's half-diagonal of it.
+ENCLOSED = 1.0e-4
+# Without bodies that draw texels to themselves they are spread evenly, as if drawn from this many half sides around.
+EVEN_SPREAD = 8.0
+
+
+@wp.struct
+class PatchTable:
+    """The faces of all slabs, and their texels."""
+
+    center: wp.array(dtype=wp.vec3)  # (entity): of a slab in the entity's frame
+    rotation: wp.array(dtype=wp.mat33)  # (entity): entity_from_slab
+    slab_half: wp.array(dtype=wp.vec3)  # (entity): half extents, metres
+    casts: wp.array(dtype=wp.bool)  # (entity): False for lights
+    first_face: wp.array(dtype=wp.int32)  # (entity): its first of six faces, -1 for what is not a slab
+    entity: wp.array(dtype=wp.int32)  # (face)
+    axis: wp.array(dtype=wp.int32)  # (face): the axis of the slab that it faces along
+    side: wp.array(dtype=wp.float32)  # (face): 1 at the axis' positive end, -1 at the other
+    half: wp.array(dtype=wp.vec3)  # (face): half extents along its own two axes, and of the slab across it, metres
+    size: wp.array(dtype=wp.vec2i)  # (face): texels along its two axes, powers of two
+    first_texel: wp.array(dtype=wp.int32)  # (face): among all faces' texels
+    first: wp.array(dtype=wp.int32)  # (face): among all faces' pyramids, the finest level first
+    levels: wp.array(dtype=wp.int32)  # (face): of its pyramid
+    texel_face: wp.array(dtype=wp.int32)  # (texel)
+    # (world, face): middle and half extent along u, and along v, of the part that is not inside other slabs, metres
+    part: wp.array2d(dtype=wp.vec4)
+    # (world, face): along u and along v, where texels are finest, from the middle of the part, and how fine
+    focus: wp.array2d(dtype=wp.vec4)
+    seen: wp.array2d(dtype=wp.int32)  # (world, face): 1 when another body rises above it
+    radiance: wp.array2d(dtype=wp.vec4)  # (world, place in a pyramid): three channels and a filler
+
+
+@dataclass(frozen=True)
+class Patches:
+    """The faces of a scene's slabs and how many texels they have together."""
+
+    table: PatchTable
+    texels: int
+
+
+@wp.func
+def axis_vector(axis: int) -> wp.vec3:
+    """A unit vector along a slab's own axis."""
+    return wp.vec3(wp.where(axis == 0, 1.0, 0.0), wp.where(axis == 1, 1.0, 0.0), wp.where(axis == 2, 1.0, 0.0))
+
+
+@wp.func
+def slab_from_world(world: int, entity: int, poses: PoseTable, patches: PatchTable) -> wp.mat33:
+    return wp.transpose(poses.rotation[world, entity] * patches.rotation[entity])
+
+
+@wp.func
+def slab_origin(world: int, entity: int, poses: PoseTable, patches: PatchTable) -> wp.vec3:
+    """The middle of a slab, in the world."""
+    return poses.position[world, entity] + poses.rotation[world, entity] * patches.center[entity]
+
+
+@wp.func
+def reach_along(
+    n: wp.vec3, world: int, entity: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable
+) -> float:
+    """How far a body reaches from its centre along a direction of the world: a slab's box, any other's sphere."""
+    if patches.first_face[entity] < 0:
+        return geometry.radius[entity]
+    n_slab = slab_from_world(world, entity, poses, patches) * n
+    return wp.dot(wp.vec3(wp.abs(n_slab[0]), wp.abs(n_slab[1]), wp.abs(n_slab[2])), patches.slab_half[entity])
+
+
+@wp.func
+def squeeze(x: float, focus: float, scale: float) -> float:
+    """Maps a line to -1..1 so that even steps of the result are finest at the focus."""
+    return (x - focus) / (scale + wp.abs(x - focus))
+
+
+@wp.func
+def texel_center(index: int, count: int, half: float, focus: float, scale: float) -> float:
+    """Where the centre of a texel lies along a side of a face, metres from its middle."""
+    low = squeeze(-half, focus, scale)
+    high = squeeze(half, focus, scale)
+    squeezed = low + (high - low) * (float(index) + 0.5) / float(count)
+    return focus + scale * squeezed / (1.0 - wp.abs(squeezed))
+
+
+@wp.func
+def uncovered_part(world: int, face: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable) -> wp.vec4:
+    """Middle and half extent along both axes of a face without the ends that other slabs enclose: walls meet so."""
+    own = patches.entity[face]
+    axis = patches.axis[face]
+    half = patches.half[face]
+    to_slab = slab_from_world(world, own, poses, patches)
+    origin = slab_origin(world, own, poses, patches)
+    skin = wp.static(ENCLOSED) * geometry.radius[own]
+    lower = -half
+    upper = wp.vec3(half[0], half[1], half[2])
+    height = patches.side[face] * half[2]
+    for entity in range(patches.casts.shape[0]):
+        if patches.casts[entity] and entity != own and patches.first_face[entity] >= 0:
+            turned = to_slab * wp.transpose(slab_from_world(world, entity, poses, patches))
+            size = patches.slab_half[entity]
+            middle = to_slab * (slab_origin(world, entity, poses, patches) - origin)
+            # Of a slab that stands askew only a box inside it counts, which for a thin one is nothing.
+            reach = wp.vec3()
+            for row in range(3):
+                largest = int(0)
+                for column in range(3):
+                    if wp.abs(turned[row, column]) > wp.abs(turned[row, largest]):
+                        largest = column
+                across = wp.abs(turned[row, 0]) + wp.abs(turned[row, 1]) + wp.abs(turned[row, 2])
+                askew = across - wp.abs(turned[row, largest])
+                reach[row] = size[largest] - askew * geometry.radius[entity]
+            if wp.abs(height - middle[axis]) <= reach[axis] + skin:
+                for which in range(2):
+                    along = (axis + 1 + which) % 3
+                    beside = (axis + 2 - which) % 3
+                    other = 1 - which
+                    low = middle[along] - reach[along]
+                    high = middle[along] + reach[along]
+                    spans = (
+                        middle[beside] - reach[beside] <= lower[other] + skin
+                        and middle[beside] + reach[beside] >= upper[other] - skin
+                    )
+                    if spans and low <= lower[which] + skin and high > lower[which]:
+                        lower[which] = wp.min(high, upper[which])
+                    if spans and high >= upper[which] - skin and low < upper[which]:
+                        upper[which] = wp.max(low, lower[which])
+    return wp.vec4(
+        0.5 * (lower[0] + upper[0]),
+        0.5 * (upper[0] - lower[0]),
+        0.5 * (lower[1] + upper[1]),
+        0.5 * (upper[1] - lower[1]),
+    )
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable):
+    world, face = wp.tid()
+    face += first
+    own = patches.entity[face]
+    axis = patches.axis[face]
+    half = patches.half[face]
+    to_slab = slab_from_world(world, own, poses, patches)
+    to_world = wp.transpose(to_slab)
+    origin = slab_origin(world, own, poses, patches)
+    n = patches.side[face] * axis_vector(axis)
+    n_world = to_world * n
+    part = uncovered_part(world, face, geometry, poses, patches)
+    patches.part[world, face] = part
+    count = float(0.0)
+    mean = wp.vec2()
+    squares = wp.vec2()
+    seen = int(0)
+    for entity in range(patches.casts.shape[0]):
+        if patches.casts[entity] and entity != own:
+            position = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
+            p = to_slab * (position - origin)
+            rise = reach_along(n_world, world, entity, geometry, poses, patches)
+            if wp.dot(n, p) + rise > half[2] + wp.static(FACE_HORIZON) * geometry.radius[own]:
+                seen = 1
+            if patches.first_face[entity] < 0:
+                # Bodies with a shape of their own draw the texels to where they are.
+                x = wp.clamp(p[(axis + 1) % 3] - part[0], -part[1], part[1])
+                y = wp.clamp(p[(axis + 2) % 3] - part[2], -part[3], part[3])
+                spread = geometry.radius[entity] * geometry.radius[entity]
+                count += 1.0
+                mean += wp.vec2(x, y)
+                squares += wp.vec2(x * x + spread, y * y + spread)
+    # The sides of a rectangle have no area, nor has what is enclosed.
+    patches.seen[world, face] = wp.where(part[1] * part[3] > 0.0, seen, 0)
+    focus = wp.vec4(0.0, wp.static(EVEN_SPREAD) * part[1], 0.0, wp.static(EVEN_SPREAD) * part[3])
+    if count > 0.0:
+        mean = mean / count
+        focus = wp.vec4(
+            mean[0],
+            wp.sqrt(wp.max(squares[0] / count - mean[0] * mean[0], 1.0e-12)),
+            mean[1],
+            wp.sqrt(wp.max(squares[1] / count - mean[1] * mean[1], 1.0e-12)),
+        )
+    patches.focus[world, face] = focus
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _place_texels(first: int, poses: PoseTable, patches: PatchTable, first_proxy: int, proxies: ReceiverTable):
+    world, texel = wp.tid()
+    texel += first
+    face = patches.texel_face[texel]
+    entity = patches.entity[face]
+    axis = patches.axis[face]
+    half = patches.half[face]
+    size = patches.size[face]
+    part = patches.part[world, face]
+    focus = patches.focus[world, face]
+    index = texel - patches.first_texel[face]
+    x = part[0] + texel_center(index % size[0], size[0], part[1], focus[0], focus[1])
+    y = part[2] + texel_center(index / size[0], size[1], part[3], focus[2], focus[3])
+    n = patches.side[face] * axis_vector(axis)
+    p = x * axis_vector((axis + 1) % 3) + y * axis_vector((axis + 2) % 3) + half[2] * n
+    to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
+    proxy = first_proxy + texel
+    # Nothing sees the light of a face above which nothing rises.
+    proxies.entity[world, proxy] = wp.where(patches.seen[world, face] == 1, entity, -1)
+    proxies.position[world, proxy] = slab_origin(world, entity, poses, patches) + to_world * p
+    proxies.normal[world, proxy] = to_world * n
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _build_pyramids(
+    first: int,
+    radiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+    first_proxy: int,
+    patches: PatchTable,
+):
+    world, face = wp.tid()
+    face += first
+    if patches.seen[world, face] == 0:
+        return
+    width = patches.size[face][0]
+    height = patches.size[face][1]
+    start = patches.first[face]
+    for index in range(width * height):
+        color = radiance[world, first_proxy + patches.first_texel[face] + index]
+        patches.radiance[world, start + index] = wp.vec4(color[0], color[1], color[2], 0.0)
+    levels = patches.levels[face]
+    for _level in range(1, levels):
+        # A side that has one texel left is no longer halved.
+        step_x = wp.where(width > 1, 1, 0)
+        step_y = wp.where(height > 1, 1, 0)
+        next_width = wp.max(width / 2, 1)
+        next_height = wp.max(height / 2, 1)
+        next_start = start + width * height
+        for index in range(next_width * next_height):
+            x = (index % next_width) * (1 + step_x)
+            y = (index / next_width) * (1 + step_y)
+            a = start + y * width + x
+            b = a + step_y * width
+            patches.radiance[world, next_start + index] = 0.25 * (
+                patches.radiance[world, a]
+                + patches.radiance[world, a + step_x]
+                + patches.radiance[world, b]
+                + patches.radiance[world, b + step_x]
+            )
+        start = next_start
+        width = next_width
+        height = next_height
+
+
+@cache
+def make_patches(order: int) -> SimpleNamespace:
+    """Device functions of faces for the directions of `order` bands: who sees them, their coverage and radiance."""
+    kit = make_coverage(order)
+    values, half_values, rgb_values = kit.values, kit.half_values, kit.rgb_values
+
+    @wp.func_native(_radiance_snippet(kit.points))
+    def look_up_directions(
+        p: wp.vec3,
+        to_face: wp.mat33,
+        half: wp.vec3,
+        size: wp.vec2i,
+        focus: wp.vec4,
+        first: int,
+        levels: int,
+        texels: wp.array(dtype=wp.vec4),
+        quadrature: wp.array(dtype=half_values),
+    ) -> rgb_values: ...
+
+    @wp.func
+    def sees_face(world: int, face: int, p_slab: wp.vec3, patches: PatchTable) -> bool:
+        """Whether a point of the slab's frame lies before a face, or touches it, and the face sends out light."""
+        half = patches.half[face]
+        height = patches.side[face] * p_slab[patches.axis[face]] - half[2]
+        return patches.seen[world, face] == 1 and height > -wp.static(LOWEST_HEIGHT) * wp.length(half)
+
+    @wp.func
+    def face_coverage(
+        world: int,
+        face: int,
+        p_slab: wp.vec3,
+        to_slab: wp.mat33,
+        patches: PatchTable,
+        quadrature: wp.array(dtype=half_values),
+    ) -> values:
+        """The directions that a face covers around a point of the slab's frame; to_slab: slab_from_world."""
+        axis = patches.axis[face]
+        side = patches.side[face]
+        half = patches.half[face]
+        height = side * p_slab[axis] - half[2]
+        part = patches.part[world, face]
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
+        p = wp.vec3()
+        p[u] = p_slab[u] - part[0]
+        p[v] = p_slab[v] - part[2]
+        p[axis] = side * wp.max(height, wp.static(LOWEST_HEIGHT) * wp.length(half))
+        flat = wp.vec3()
+        flat[u] = part[1]
+        flat[v] = part[3]
+        return kit.slab_coverage(p, flat, wp.transpose(to_slab), quadrature)
+
+    @wp.func
+    def face_radiance(
+        world: int,
+        face: int,
+        p_slab: wp.vec3,
+        to_slab: wp.mat33,
+        patches: PatchTable,
+        quadrature: wp.array(dtype=half_values),
+    ) -> rgb_values:
+        """The radiance of a face in every direction from a point of the slab's frame; to_slab: slab_from_world."""
+        axis = patches.axis[face]
+        side = patches.side[face]
+        half = patches.half[face]
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
+        to_face = wp.matrix_from_rows(to_slab[u], to_slab[v], side * to_slab[axis])
+        lowest = wp.static(LOWEST_HEIGHT) * wp.length(half)
+        part = patches.part[world, face]
+        p = wp.vec3(p_slab[u] - part[0], p_slab[v] - part[2], wp.max(side * p_slab[axis] - half[2], lowest))
+        focus = patches.focus[world, face]
+        size = patches.size[face]
+        return look_up_directions(
+            p,
+            to_face,
+            wp.vec3(wp.max(part[1], 1.0e-9), wp.max(part[3], 1.0e-9), 0.0),
+            size,
+            focus,
+            patches.first[face],
+            patches.levels[face],
+            patches.radiance[world],
+            quadrature,
+        )
+
+    return SimpleNamespace(sees_face=sees_face, face_coverage=face_coverage, face_radiance=face_radiance)
+
+
+def _radiance_snippet(points: int) -> str:
+    """C++: where each direction meets the face, then what the pyramid holds there.
+
+    Of two antipodes one meets the plane of the face. The other sees none of it but for the ringing of its
+    band-limited coverage, and gets the mean. A direction that passes by gets the nearest of the rim.
+    """
+    half = points // 2
+    # A direction stands for this solid angle; seen under the cosine c it covers t^2 / c of it at the distance t.
+    solid_angle = 4 * math.pi / points
+    return f"""
+    const float low_u = -(half[0] + focus[0]) / (focus[1] + ::fabsf(half[0] + focus[0]));
+    const float low_v = -(half[1] + focus[2]) / (focus[3] + ::fabsf(half[1] + focus[2]));
+    const float scale_u = 1.0f / ((half[0] - focus[0]) / (focus[1] + ::fabsf(half[0] - focus[0])) - low_u);
+    const float scale_v = 1.0f / ((half[1] - focus[2]) / (focus[3] + ::fabsf(half[1] - focus[2])) - low_v);
+    const float texels_per_area = focus[1] * scale_u * size[0] * focus[3] * scale_v * size[1];
+    float place_u[{half}], place_v[{half}], level_at[{half}];
+    int meets[{half}];
+    for (int i = 0; i < {half}; ++i) {{
+        const float x = quadrature.data[0][i], y = quadrature.data[1][i], z = quadrature.data[2][i];
+        const float du = to_face.data[0][0] * x + to_face.data[0][1] * y + to_face.data[0][2] * z;
+        const float dv = to_face.data[1][0] * x + to_face.data[1][1] * y + to_face.data[1][2] * z;
+        const float dn = to_face.data[2][0] * x + to_face.data[2][1] * y + to_face.data[2][2] * z;
+        const float steep = dn < 0.0f ? -dn : dn;
+        const float cosine = steep > 1.0e-4f ? steep : 1.0e-4f;
+        const float t = p[2] / cosine, along = dn < 0.0f ? t : -t;
+        float u = p[0] + along * du, v = p[1] + along * dv;
+        u = u < -half[0] ? -half[0] : (u > half[0] ? half[0] : u);
+        v = v < -half[1] ? -half[1] : (v > half[1] ? half[1] : v);
+        const float off_u = u - focus[0], off_v = v - focus[2];
+        const float near_u = 1.0f / (focus[1] + (off_u < 0.0f ? -off_u : off_u));
+        const float near_v = 1.0f / (focus[3] + (off_v < 0.0f ? -off_v : off_v));
+        const float covered =
+            {solid_angle:.9e}f * t * t / cosine * texels_per_area * near_u * near_u * near_v * near_v;
+        place_u[i] = (off_u * near_u - low_u) * scale_u;
+        place_v[i] = (off_v * near_v - low_v) * scale_v;
+        // Half the binary logarithm of the texels covered, its fraction taken as linear.
+        union {{ float number; int bits; }} both;
+        both.number = covered < 1.0f ? 1.0f : covered;
+        level_at[i] = 0.5f * ((float)(both.bits - 0x3f800000) * {2.0**-23:.9e}f);
+        meets[i] = dn < 0.0f ? i : {half} + i;
+    }}
+    int starts[16];
+    starts[0] = first;
+    for (int level = 1; level < levels; ++level) {{
+        const int width = size[0] >> (level - 1), height = size[1] >> (level - 1);
+        starts[level] = starts[level - 1] + (width > 1 ? width : 1) * (height > 1 ? height : 1);
+    }}
+    const auto& mean = texels.data[starts[levels - 1]];
+    wp::vec_t<{3 * points}, float> all;
+    for (int i = 0; i < {half}; ++i) {{
+        const float last = (float)(levels - 1), wanted = level_at[i] < last ? level_at[i] : last;
+        const int fine = (int)wanted;
+        const float share = wanted - (float)fine;
+        float sum[4] = {{0.0f, 0.0f, 0.0f, 0.0f}};
+        for (int step = 0; step < 2; ++step) {{
+            const float weight = step ? share : 1.0f - share;
+            if (weight <= 0.0f) continue;
+            const int level = fine + step;
+            const int halved_width = size[0] >> level, halved_height = size[1] >> level;
+            const int width = halved_width > 1 ? halved_width : 1, height = halved_height > 1 ? halved_height : 1;
+            float column = place_u[i] * (float)width - 0.5f, row = place_v[i] * (float)height - 0.5f;
+            column = column < 0.0f ? 0.0f : (column > (float)(width - 1) ? (float)(width - 1) : column);
+            row = row < 0.0f ? 0.0f : (row > (float)(height - 1) ? (float)(height - 1) : row);
+            const int left = (int)column, top = (int)row;
+            const int right = left + 1 < width ? left + 1 : left, below = top + 1 < height ? top + 1 : top;
+            const float a = column - (float)left, b = row - (float)top;
+            const auto* texel = texels.data + starts[level];
+            for (int c = 0; c < 4; ++c)
+                sum[c] += weight * ((1.0f - b) * ((1.0f - a) * texel[top * width + left][c]
+                    + a * texel[top * width + right][c]) + b * ((1.0f - a) * texel[below * width + left][c]
+                    + a * texel[below * width + right][c]));
+        }}
+        const int toward = meets[i], away = toward < {half} ? toward + {half} : toward - {half};
+        for (int c = 0; c < 3; ++c) {{
+            all[c * {points} + toward] = sum[c];
+            all[c * {points} + away] = mean[c];
+        }}
+    }}
+    return all;
+    """
+
+
+def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState, worlds: int, device: wp.Device):
+    """The faces of those entities for which `is_patch` holds; all of them must be slabs."""
+    occluders = occlusion.table.occluders
+    table = PatchTable()
+    table.center, table.rotation = occluders.slab_center, occluders.slab_rotation
+    table.slab_half, table.casts = occluders.slab_half, occluders.casts
+    chosen = [entity for entity, flat in enumerate(is_patch) if flat]
+    halves = {entity: np.asarray(_slab_half(scene, entity), np.float64) for entity in chosen}
+    limits = _share_texels(halves)
+    first_face, faces, halved, sizes = np.full(len(is_patch), -1), [], [], []
+    for entity in chosen:
+        first_face[entity] = len(faces)
+        for axis in range(3):
+            u, v = (axis + 1) % 3, (axis + 2) % 3
+            faces += [(entity, axis, 1.0), (entity, axis, -1.0)]
+            size = _face_size(halves[entity][[u, v]], halves[entity].max(), limits[entity])
+            sizes += [size, size]
+            halved += [halves[entity][[u, v, axis]]] * 2
+    sizes = np.array(sizes, np.int64).reshape(-1, 2)
+    texels, levels = sizes.prod(axis=1), np.log2(sizes.max(axis=1, initial=1)).astype(np.int64) + 1
+    places = [
+        int(sum(max(w >> level, 1) * max(h >> level, 1) for level in range(count)))
+        for (w, h), count in zip(sizes, levels, strict=True)
+    ]
+
+    def upload(values, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=device)
+
+    table.first_face = upload(first_face, wp.int32)
+    table.entity = upload([face[0] for face in faces], wp.int32)
+    table.axis = upload([face[1] for face in faces], wp.int32)
+    table.side = upload([face[2] for face in faces], wp.float32)
+    table.half = upload(np.array(halved).reshape(-1, 3), wp.vec3)
+    table.size = upload(sizes, wp.vec2i)
+    table.first_texel = upload(np.cumsum(texels) - texels, wp.int32)
+    table.first = upload(np.cumsum(places) - places, wp.int32)
+    table.levels = upload(levels, wp.int32)
+    table.texel_face = upload(np.repeat(np.arange(len(faces)), texels), wp.int32)
+    table.part = wp.zeros((worlds, len(faces)), dtype=wp.vec4, device=device)
+    table.focus = wp.zeros((worlds, len(faces)), dtype=wp.vec4, device=device)
+    table.seen = wp.zeros((worlds, len(faces)), dtype=wp.int32, device=device)
+    table.radiance = wp.zeros((worlds, sum(places)), dtype=wp.vec4, device=device)
+    return Patches(table, int(texels.sum()))
+
+
+def place_texels(
+    patches: Patches, scene: DeviceScene, proxies: ReceiverTable, first_proxy: int, device: wp.Device
+) -> None:
+    """Puts the texels where the bodies need them and makes proxies of them, from `first_proxy` on."""
+    table, worlds = patches.table, patches.table.focus.shape[0]
+    launch(_focus_faces, table.focus.shape, [scene.geometry, scene.poses, table], [], device)
+    inputs = [scene.poses, table, first_proxy, proxies]
+    launch(_place_texels, (worlds, patches.texels), inputs, [], device)
+
+
+def build_pyramids(patches: Patches, radiance: wp.array, first_proxy: int, device: wp.Device) -> None:
+    """Takes over the radiance of the proxies, vec3 (world, proxy), and filters it."""
+    launch(_build_pyramids, patches.table.focus.shape, [radiance, first_proxy, patches.table], [], device)
+
+
+def _slab_half(scene: Scene, entity: int) -> np.ndarray:
+    slab = scene.meshes[scene.entities[entity].mesh].slab
+    if slab is None:
+        raise ValueError(f"{scene.entities[entity].name} is not a slab; only boxes and rectangles have faces")
+    return slab[2]
+
+
+def _share_texels(halves: dict[int, np.ndarray]) -> dict[int, int]:
+    """How many texels the longest side of each slab gets: the smallest slabs give up theirs until all fit."""
+    limits = dict.fromkeys(halves, MOST_TEXELS_PER_SIDE)
+
+    def count(entity: int) -> int:
+        half = halves[entity]
+        sides = [_face_size(half[[u, v]], half.max(), limits[entity]) for u, v in ((1, 2), (2, 0), (0, 1))]
+        return sum(2 * a * b for a, b in sides)
+
+    while sum(map(count, limits)) > MOST_TEXELS:
+        finest = max(limits.values())
+        if finest == FEWEST_TEXELS_PER_SIDE:
+            break
+        smallest = min(
+            (entity for entity in limits if limits[entity] == finest), key=lambda entity: halves[entity].max()
+        )
+        limits[smallest] //= 2
+    return limits
+
+
+def _face_size(sides: np.ndarray, longest: float, limit: int) -> tuple[int, int]:
+    wanted = limit * sides / longest
+    powers = 2 ** np.ceil(np.log2(np.maximum(wanted, 1.0) * (1 - 1e-9))).astype(int)
+    width, height = np.clip(powers, min(FEWEST_TEXELS_PER_SIDE, limit), limit)
+    return int(width), int(height)
