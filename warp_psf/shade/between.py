@@ -115,7 +115,8 @@ def hides_face(
     )
     extent = extent_of_face(world, face, poses, patches)
     other = extent_of(world, occluder, geometry, poses, patches)
-    share = 1.0 - part_behind(other, n, wp.dot(n, other.center - extent.center))
+    # What is half sunk into the face hides as much as its upper half does.
+    share = wp.min(2.0 - 2.0 * part_behind(other, n, wp.dot(n, other.center - extent.center)), 1.0)
     if share > 0.0 and patches.first_face[occluder] >= 0:
         share = wp.min(share, behind_slab(world, occluder, extent, p, poses, patches))
     return share

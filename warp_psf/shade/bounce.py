@@ -28,6 +28,7 @@ from warp_psf.shade.between import MOST_SOURCES, hides_face, make_between
 from warp_psf.shade.direct import DirectState, make_direct
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.patches import (
+    BLOCK,
     Patches,
     PatchTable,
     build_pyramids,
@@ -83,12 +84,13 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
     class KeptTable:
         """What the proxies receive per unit of light, kept for as long as nothing moves."""
 
-        count: wp.array2d(dtype=wp.int32)  # (world, proxy)
-        entity: wp.array3d(dtype=wp.int32)  # (world, proxy, place)
-        irradiance: wp.array3d(dtype=per_function)  # (world, proxy, place): basis irradiances
-        face_count: wp.array2d(dtype=wp.int32)  # (world, proxy)
-        face: wp.array3d(dtype=wp.int32)  # (world, proxy, place)
-        # (world, proxy, place): what the radiance of the face at the directions is to be multiplied with
+        proxy: wp.array(dtype=wp.int32)  # (station): the proxies at which bounced light is gathered
+        count: wp.array2d(dtype=wp.int32)  # (world, station)
+        entity: wp.array3d(dtype=wp.int32)  # (world, station, place)
+        irradiance: wp.array3d(dtype=per_function)  # (world, station, place): basis irradiances
+        face_count: wp.array2d(dtype=wp.int32)  # (world, station)
+        face: wp.array3d(dtype=wp.int32)  # (world, station, place)
+        # (world, station, place): what the radiance of the face at the directions is to be multiplied with
         transport: wp.array3d(dtype=values)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -105,8 +107,9 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         threshold: float,
         kept: KeptTable,
     ):
-        world, proxy = wp.tid()
-        proxy += first
+        world, station = wp.tid()
+        station += first
+        proxy = kept.proxy[station]
         own = proxies.entity[world, proxy]
         if own < 0:
             return
@@ -134,8 +137,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
                 where = radiant.locate(fields, bodies.field[source], p_body)
                 received = kit.project(wp.cw_mul(passed, weighted), o.rows[world, source])
-                kept.entity[world, proxy, count] = source
-                kept.irradiance[world, proxy, count] = radiant.basis_irradiance(fields, where, received)
+                kept.entity[world, station, count] = source
+                kept.irradiance[world, station, count] = radiant.basis_irradiance(fields, where, received)
                 count += 1
             elif patches.first_face[source] >= 0:
                 to_slab = slab_from_world(world, source, poses, patches)
@@ -149,11 +152,11 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                                 share = hides_face(world, sources.entity[other], face, p, geometry, poses, patches)
                                 if share > 0.0:
                                     passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                        kept.face[world, proxy, faces] = face
-                        kept.transport[world, proxy, faces] = wp.cw_mul(passed, weighted)
+                        kept.face[world, station, faces] = face
+                        kept.transport[world, station, faces] = wp.cw_mul(passed, weighted)
                         faces += 1
-        kept.count[world, proxy] = count
-        kept.face_count[world, proxy] = faces
+        kept.count[world, station] = count
+        kept.face_count[world, station] = faces
 
     @wp.kernel(enable_backward=False, module="unique")
     def leave_surface(
@@ -184,30 +187,32 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         patches: PatchTable,
         bodies: BodyTable,
         kept: KeptTable,
+        first_texel: int,
         radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         total_out: wp.array2d(dtype=wp.vec3),  # (world, proxy), added to
     ):
-        world, proxy = wp.tid()
-        proxy += first
+        world, station = wp.tid()
+        station += first
+        proxy = kept.proxy[station]
         own = proxies.entity[world, proxy]
         if own < 0:
             return
         irradiance = wp.vec3()
-        for place in range(kept.count[world, proxy]):
-            received = kept.irradiance[world, proxy, place]
-            source = kept.entity[world, proxy, place]
+        for place in range(kept.count[world, station]):
+            received = kept.irradiance[world, station, place]
+            source = kept.entity[world, station, place]
             irradiance += wp.vec3(
                 wp.dot(received, bodies.weights[world, source, 0]),
                 wp.dot(received, bodies.weights[world, source, 1]),
                 wp.dot(received, bodies.weights[world, source, 2]),
             )
-        for place in range(kept.face_count[world, proxy]):
-            face = kept.face[world, proxy, place]
-            slab = patches.entity[face]
+        for place in range(kept.face_count[world, station]):
+            seen = kept.face[world, station, place]
+            slab = patches.entity[seen]
             to_slab = slab_from_world(world, slab, poses, patches)
             p_slab = to_slab * (proxies.position[world, proxy] - slab_origin(world, slab, poses, patches))
-            shown = patch.face_radiance(world, face, p_slab, to_slab, patches, o.quadrature)
-            irradiance += kit.sum_rgb(kept.transport[world, proxy, place], shown)
+            shown = patch.face_radiance(world, seen, p_slab, to_slab, patches, o.quadrature)
+            irradiance += kit.sum_rgb(kept.transport[world, station, place], shown)
         if bodies.field[own] >= 0:
             from_itself = bodies.own[proxy]
             irradiance += wp.vec3(
@@ -217,8 +222,22 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             )
         reflectance = geometry.albedo[own] + geometry.specular[own]
         radiance = wp.cw_mul(reflectance, wp.max(irradiance, wp.vec3())) / wp.pi
-        radiance_out[world, proxy] = radiance
-        total_out[world, proxy] = total_out[world, proxy] + radiance
+        if proxy < first_texel:
+            radiance_out[world, proxy] = radiance
+            total_out[world, proxy] = total_out[world, proxy] + radiance
+            return
+        face = patches.texel_face[proxy - first_texel]
+        size = patches.size[face]
+        start = first_texel + patches.first_texel[face]
+        across = wp.min(wp.static(BLOCK), size[0])
+        down = wp.min(wp.static(BLOCK), size[1])
+        left = (proxy - start) % size[0] / across * across
+        top = (proxy - start) / size[0] / down * down
+        for y in range(top, top + down):
+            for x in range(left, left + across):
+                texel = start + y * size[0] + x
+                radiance_out[world, texel] = radiance
+                total_out[world, texel] = total_out[world, texel] + radiance
 
     @wp.kernel(enable_backward=False, module="unique")
     def solve_weights(
@@ -399,7 +418,7 @@ def upload_bounces(
         upload(stack(points, 3), wp.vec3),
         upload(stack(normals, 3), wp.vec3),
         bodies,
-        _make_kept(kit, worlds, slots, len(chosen), sum(is_patch), device),
+        _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device),
         upload_radiance(fields, order, functions, device),
         patches,
         weights,
@@ -432,7 +451,7 @@ def gather_basis_irradiances(
     place_texels(state.patches, scene, state.proxies, state.first_texel, device)
     tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.fields]
     inputs = [state.proxies, *tables, state.bodies, threshold]
-    launch(kit.gather_basis, state.turns.shape, inputs, [state.kept], device)
+    launch(kit.gather_basis, state.kept.count.shape, inputs, [state.kept], device)
 
 
 def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, times: int, device: wp.Device) -> None:
@@ -447,7 +466,7 @@ def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, ti
     for _ in range(times - 1):
         _represent(state, state.radiance, device)
         inputs = [state.proxies, scene.geometry, scene.poses, occlusion.table, patches.table, state.bodies, state.kept]
-        launch(kit.bounce_light, shape, inputs, outputs, device)
+        launch(kit.bounce_light, state.kept.count.shape, [*inputs, state.first_texel], outputs, device)
     _represent(state, state.total, device)
     inputs = [state.bodies, state.own_entities, state.own_rows, state.own_functions]
     launch(kit.light_itself, state.own_light.shape, inputs, [state.own_light], device)
@@ -491,15 +510,20 @@ def _upload_own(radiating: list, functions: int, worlds: int, device: wp.Device)
     )
 
 
-def _make_kept(kit: SimpleNamespace, worlds: int, slots: int, bodies: int, slabs: int, device: wp.Device):
+def _make_kept(
+    kit: SimpleNamespace, worlds: int, first_texel: int, patches: Patches, bodies: int, slabs: int, device: wp.Device
+):
     places, faces = min(MOST_SOURCES, bodies), min(MOST_FACES, 3 * slabs)
+    stations = np.concatenate([np.arange(first_texel), first_texel + patches.stations])
+    shape = (worlds, len(stations))
     kept = kit.KeptTable()
-    kept.count = wp.zeros((worlds, slots), dtype=wp.int32, device=device)
-    kept.entity = wp.zeros((worlds, slots, places), dtype=wp.int32, device=device)
-    kept.irradiance = wp.zeros((worlds, slots, places), dtype=kit.radiant.weights, device=device)
-    kept.face_count = wp.zeros((worlds, slots), dtype=wp.int32, device=device)
-    kept.face = wp.zeros((worlds, slots, faces), dtype=wp.int32, device=device)
-    kept.transport = wp.zeros((worlds, slots, faces), dtype=kit.values, device=device)
+    kept.proxy = wp.array(stations, dtype=wp.int32, device=device)
+    kept.count = wp.zeros(shape, dtype=wp.int32, device=device)
+    kept.entity = wp.zeros((*shape, places), dtype=wp.int32, device=device)
+    kept.irradiance = wp.zeros((*shape, places), dtype=kit.radiant.weights, device=device)
+    kept.face_count = wp.zeros(shape, dtype=wp.int32, device=device)
+    kept.face = wp.zeros((*shape, faces), dtype=wp.int32, device=device)
+    kept.transport = wp.zeros((*shape, faces), dtype=kit.values, device=device)
     return kept
 
 

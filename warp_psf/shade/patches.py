@@ -22,17 +22,23 @@ from warp_psf.shade.coverage import make_coverage
 from warp_psf.shade.occlude import OcclusionState
 
 # Texels along the longest side of a slab, and of all slabs together; the smallest slabs give some up first.
-MOST_TEXELS_PER_SIDE = 32
-MOST_TEXELS = 12288
+MOST_TEXELS_PER_SIDE = 64
+MOST_TEXELS = 32768
+# Direct light is followed at every texel, as shadows have edges; bounced light at one of each block of so many by so
+# many, as it has none.
+BLOCK = 4
 # However short a side is, it gets two texels: light falls off towards edges.
 FEWEST_TEXELS_PER_SIDE = 2
 # A point closer to a face than this share of the slab's half-diagonal sees it from this height: bodies that touch it
 # sink in a little, and from the plane itself a face is not seen.
 LOWEST_HEIGHT = 1.0e-4
 # Bodies that rise above a face by less than this share of the slab's half-diagonal do not see it.
-FACE_HORIZON = 1.0e-5
+FACE_HORIZON = 1.0e-4
 # A slab encloses the end of a face when it reaches to within this share of the other's half-diagonal of it.
 ENCLOSED = 1.0e-4
+# The radiance is filtered over this share of the solid angle that a direction stands for: all of it would wash out
+# contact shadows, none would let single texels flicker through.
+SAMPLE_SHARE = 0.1
 # Without bodies that draw texels to themselves they are spread evenly, as if drawn from this many half sides around.
 EVEN_SPREAD = 8.0
 
@@ -65,10 +71,14 @@ class PatchTable:
 
 @dataclass(frozen=True)
 class Patches:
-    """The faces of a scene's slabs and how many texels they have together."""
+    """The faces of a scene's slabs.
+
+    texels: how many they have together. stations: texels at which bounced light is gathered, one in each block.
+    """
 
     table: PatchTable
     texels: int
+    stations: np.ndarray
 
 
 @wp.func
@@ -371,8 +381,8 @@ def _radiance_snippet(points: int) -> str:
     band-limited coverage, and gets the mean. A direction that passes by gets the nearest of the rim.
     """
     half = points // 2
-    # A direction stands for this solid angle; seen under the cosine c it covers t^2 / c of it at the distance t.
-    solid_angle = 4 * math.pi / points
+    # Seen under the cosine c at the distance t a solid angle covers t^2 / c times as much of the face.
+    solid_angle = SAMPLE_SHARE * 4 * math.pi / points
     return f"""
     const float low_u = -(half[0] + focus[0]) / (focus[1] + ::fabsf(half[0] + focus[0]));
     const float low_v = -(half[1] + focus[2]) / (focus[3] + ::fabsf(half[1] + focus[2]));
@@ -488,7 +498,8 @@ def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState
     table.focus = wp.zeros((worlds, len(faces)), dtype=wp.vec4, device=device)
     table.seen = wp.zeros((worlds, len(faces)), dtype=wp.int32, device=device)
     table.radiance = wp.zeros((worlds, sum(places)), dtype=wp.vec4, device=device)
-    return Patches(table, int(texels.sum()))
+    stations = [start + _block_centers(size) for start, size in zip(np.cumsum(texels) - texels, sizes, strict=True)]
+    return Patches(table, int(texels.sum()), np.concatenate([np.zeros(0, np.int64), *stations]))
 
 
 def place_texels(
@@ -504,6 +515,13 @@ def place_texels(
 def build_pyramids(patches: Patches, radiance: wp.array, first_proxy: int, device: wp.Device) -> None:
     """Takes over the radiance of the proxies, vec3 (world, proxy), and filters it."""
     launch(_build_pyramids, patches.table.focus.shape, [radiance, first_proxy, patches.table], [], device)
+
+
+def _block_centers(size: np.ndarray) -> np.ndarray:
+    """The middle texel of each block of a face."""
+    across, down = np.minimum(BLOCK, size)
+    x, y = np.arange(across // 2, size[0], across), np.arange(down // 2, size[1], down)
+    return (y[:, None] * size[0] + x).ravel()
 
 
 def _slab_half(scene: Scene, entity: int) -> np.ndarray:

@@ -34,6 +34,8 @@ ALIGNED, NOT_ALIGNED = 0.7, 0.2
 LEVEL, NOT_LEVEL = 0.25, 0.5
 # The least sum of weights with which a pixel counts as served.
 LEAST_WEIGHT = 2.0e-4
+# In the widest cells so much of the weight must be there, or half of a cell would look like its other half.
+HALF_SERVED = 0.6
 # A probe at the far end of a cell counts so much: where it is the only one it is better than none.
 FAR_WEIGHT = 1.0e-3
 # Room for probes at first, as a share of the pixels; it grows when a picture needs more.
@@ -131,14 +133,15 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
         pixel: int,
         spacing: int,
         response: wide,
+        least: float,
         direct: wp.vec3,
         probes: ProbeTable,
         receivers: ReceiverTable,
         light: wp.array2d(dtype=wide),
     ) -> bool:
-        """Whether the probes of a pixel's cell serve it, and agree."""
+        """Whether the probes of a pixel's cell serve it with at least the weight `least`, and agree."""
         corners, weights = cell_of(world, pixel, pixel, spacing, probes, receivers)
-        if weights[0] + weights[1] + weights[2] + weights[3] < wp.static(LEAST_WEIGHT):
+        if weights[0] + weights[1] + weights[2] + weights[3] < least:
             return False
         lowest = wp.vec3(1.0e30, 1.0e30, 1.0e30)
         highest = wp.vec3()
@@ -184,8 +187,10 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
                 if receivers.entity[world, pixel] >= 0:
                     surface = kit.surface_of(world, pixel, receivers, geometry, poses, lighting)
                     response = response_of(world, surface, poses, lighting)
-                    received = direct[world, pixel]
-                    smooth = has_smooth_cell(world, pixel, spacing, response, received, probes, receivers, light)
+                    least = wp.where(turn == 0, wp.static(HALF_SERVED), wp.static(LEAST_WEIGHT))
+                    smooth = has_smooth_cell(
+                        world, pixel, spacing, response, least, direct[world, pixel], probes, receivers, light
+                    )
         if not smooth:
             corner = above * probes.width + left
             probes.refined[world, corner] = probes.refined[world, corner] + (1 << turn)
@@ -309,11 +314,13 @@ def _find_pixels(
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _choose_lattice(first: int, probes: ProbeTable, receivers: ReceiverTable, chosen_out: wp.array2d(dtype=wp.int32)):
+def _choose_lattice(
+    first: int, spacing: int, probes: ProbeTable, receivers: ReceiverTable, chosen_out: wp.array2d(dtype=wp.int32)
+):
     world, cell = wp.tid()
     cell += first
-    columns = (probes.width + wp.static(SPACINGS[0] - 1)) / wp.static(SPACINGS[0])
-    pixel = wp.static(SPACINGS[0]) * (cell % columns + cell / columns * probes.width)
+    columns = (probes.width + spacing - 1) / spacing
+    pixel = spacing * (cell % columns + cell / columns * probes.width)
     chosen_out[world, pixel] = wp.where(receivers.entity[world, pixel] >= 0, 1, 0)
 
 
@@ -401,7 +408,7 @@ def gather_last_bounce(
     launch(_find_pixels, extra.shape, [extra, extra_count], [gather.pixel_of], device)
     seen = [pixels, scene.geometry, scene.poses, lighting.table]
     cells = [-(-table.width // spacing) * -(-table.height // spacing) for spacing in SPACINGS]
-    launch(_choose_lattice, (worlds, cells[0]), [table, pixels], [gather.chosen], device)
+    launch(_choose_lattice, (worlds, cells[0]), [SPACINGS[0], table, pixels], [gather.chosen], device)
     _gather_chosen(gather, pixels, scene, occlusion, lighting, device)
     for turn in range(len(SPACINGS) - 1):
         inputs = [turn, table, *seen, gather.light, direct]
