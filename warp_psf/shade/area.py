@@ -144,4 +144,4 @@ def make_area(order: int) -> SimpleNamespace:
                     total += cosine * wp.pow(aligned, exponent) * solid_angle
         return 0.5 * (exponent + 2.0) / wp.pi * total
 
-    return SimpleNamespace(area_irradiance=area_irradiance, area_gloss=area_gloss)
+    return SimpleNamespace(sphere_irradiance=sphere_irradiance, area_irradiance=area_irradiance, area_gloss=area_gloss)

@@ -5,17 +5,24 @@ behind it, which pops when two of them swap places. Here each pair has a share o
 body lies before the other, 0 where it lies behind, and passes smoothly in between.
 """
 
+import math
 from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
+from warp_psf.basis import sh
 from warp_psf.scene.geometry import GeometryTable, PoseTable
+from warp_psf.shade.area import make_area
+from warp_psf.shade.direct import legendre_series
+from warp_psf.shade.directions import sum_in_lanes
 from warp_psf.shade.occlude import make_occlude
 from warp_psf.shade.patches import PatchTable, axis_vector, slab_from_world, slab_origin
 
 # As many bodies send light to a receiver at once; where there are more, those that take up least of its view fade out.
 MOST_SOURCES = 24
+# The gain at the horizon is bounded: right below it both irradiances are next to nothing.
+MOST_GAIN = 1.5
 # Two bounding spheres whose cones overlap by this share of the way from touching to standing behind one another hide
 # one another as far as their distances say; towards touching that fades.
 TOUCHING = 0.25
@@ -128,10 +135,20 @@ def make_between(order: int) -> SimpleNamespace:
     kit = make_occlude(order)
     Occlusion = kit.Occlusion
     lists = wp.types.matrix((MOST_SOURCES, kit.points), wp.float32)
+    values, half_values = kit.values, kit.half_values
+    area = make_area(order)
     ids = wp.types.vector(MOST_SOURCES, wp.int32)
     numbers = wp.types.vector(MOST_SOURCES, wp.float32)
     ranks = wp.types.vector(MOST_SOURCES + 1, wp.float32)
     directions = wp.types.matrix((MOST_SOURCES, 3), wp.float32)
+
+    @wp.func_native(_moments_snippet(kit.points))
+    def moments(weighted: values, quadrature: wp.array(dtype=half_values)) -> wp.vec4:
+        """The integrals of a function times the direction, and of the function, from its weighted values."""
+
+    @wp.func_native(_disc_snippet(order))
+    def disc_irradiance(x: float, squared: float, cosine: float) -> float:
+        """The irradiance of a uniform disc on `order` bands: x, squared: cosine and squared sine of its half-angle."""
 
     @wp.struct
     class Sources:
@@ -230,6 +247,26 @@ def make_between(order: int) -> SimpleNamespace:
         return sources
 
     @wp.func
+    def horizon_gain(covered: values, n: wp.vec3, weights: values, quadrature: wp.array(dtype=half_values)) -> float:
+        """What the irradiance that a body causes is to be multiplied with: a band-limited cosine has a blurred horizon.
+
+        The ratio between the irradiances of a uniform disc of the body's solid angle in its direction: in closed form
+        over the same on SH. It matters to what stands on the same floor far away, or just rises above the horizon.
+        """
+        seen = moments(wp.cw_mul(covered, weights), quadrature)
+        toward = wp.vec3(seen[0], seen[1], seen[2])
+        length = wp.length(toward)
+        if length <= 0.0 or seen[3] <= 0.0:
+            return 0.0
+        cosine = wp.dot(n, toward) / length
+        # The solid angle is 2 pi (1 - x), x the cosine of the disc's half-angle.
+        x = wp.clamp(1.0 - seen[3] / (2.0 * wp.pi), 0.0, 1.0)
+        squared = wp.max(1.0 - x * x, 1.0e-9)
+        exact = area.sphere_irradiance(cosine, 1.0 / squared)
+        limited = disc_irradiance(x, squared, cosine)
+        return wp.clamp(exact / wp.max(limited, 1.0e-9), 0.0, wp.static(MOST_GAIN))
+
+    @wp.func
     def overlap(sources: Sources, a: int, b: int) -> float:
         """How far the cones of two bounding spheres overlap: 0 not at all, 1 enough to hide one another."""
         # What lies beside another hides nothing of it, although band-limited coverages overlap there.
@@ -262,4 +299,39 @@ def make_between(order: int) -> SimpleNamespace:
             share *= wp.clamp(0.5 + further / (sources.radius[place] + sources.radius[other]), 0.0, 1.0)
         return share
 
-    return SimpleNamespace(**vars(kit), lists=lists, Sources=Sources, find_sources=find_sources, hides_body=hides_body)
+    return SimpleNamespace(
+        **vars(kit),
+        lists=lists,
+        numbers=numbers,
+        Sources=Sources,
+        find_sources=find_sources,
+        hides_body=hides_body,
+        horizon_gain=horizon_gain,
+    )
+
+
+def _moments_snippet(points: int) -> str:
+    half = points // 2
+    odd = "(weighted[i + lane] - weighted[HALF + i + lane])".replace("HALF", str(half))
+    even = odd.replace(" - ", " + ")
+    terms = [f"{odd} * quadrature.data[{axis}][i + lane]" for axis in range(3)] + [even]
+    sums = " ".join(f"{{ {sum_in_lanes(half, term)} result[{k}] = sums[0]; }}" for k, term in enumerate(terms))
+    return f"wp::vec_t<4, float> result; {sums} return result;"
+
+
+def _disc_snippet(order: int) -> str:
+    """C++: the sum over bands of the disc's and the clamped cosine's coefficients, times P_l of the cosine."""
+    receiving = legendre_series(sh.clamped_cosine(order))
+    lines = [f"float total = {2 * math.pi * receiving[0]:.9e}f * squared / (1.0f + x);"]
+    lines += ["float before = 1.0f, now = cosine, p_before = 1.0f, p = x, slope_before = 0.0f, slope = 1.0f;"]
+    for band in range(1, order):
+        # The integral of P_l over the disc is 2 pi squared P_l'(x) / (l (l + 1)).
+        share = 2 * math.pi * receiving[band] / (band * (band + 1))
+        lines += [f"total += {share:.9e}f * squared * slope * now;"]
+        up, down = (2 * band + 1) / (band + 1), band / (band + 1)
+        lines += [
+            f"{{ const float next = {up:.9e}f * cosine * now - {down:.9e}f * before; before = now; now = next; }}",
+            f"{{ const float next = slope_before + {2 * band + 1}.0f * p; slope_before = slope; slope = next; }}",
+            f"{{ const float next = {up:.9e}f * x * p - {down:.9e}f * p_before; p_before = p; p = next; }}",
+        ]
+    return " ".join([*lines, "return total;"])

@@ -119,9 +119,11 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         transfer = wp.cw_mul(transfer, lighting.weights[0])
         sources = between.find_sources(world, own, p, surface.normal, threshold, geometry, poses, patches, o)
         covers = between.lists()
+        gain = between.numbers()
         for place in range(sources.count):
             covered = kit.covered_by(world, sources.entity[place], p, geometry, poses, o)
             covers[place] = sources.weight[place] * covered
+            gain[place] = between.horizon_gain(covered, surface.normal, lighting.weights[0], o.quadrature)
         count = int(0)
         faces = int(0)
         for place in range(sources.count):
@@ -136,7 +138,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
                 where = radiant.locate(fields, bodies.field[source], p_body)
-                received = kit.project(wp.cw_mul(passed, weighted), o.rows[world, source])
+                received = kit.project(gain[place] * wp.cw_mul(passed, weighted), o.rows[world, source])
                 kept.entity[world, station, count] = source
                 kept.irradiance[world, station, count] = radiant.basis_irradiance(fields, where, received)
                 count += 1

@@ -91,10 +91,10 @@ def basis_at_directions(order: int) -> np.ndarray:
 
 
 def _sum_of_products_snippet(points: int) -> str:
-    return f"{_sum_in_lanes(points, 'a[i + lane] * b[i + lane]')} return sums[0];"
+    return f"{sum_in_lanes(points, 'a[i + lane] * b[i + lane]')} return sums[0];"
 
 
-def _sum_in_lanes(count: int, product: str) -> str:
+def sum_in_lanes(count: int, product: str) -> str:
     """C++ that leaves the sum over `i + lane` in sums[0].
 
     Sums side by side are added at once by a CPU; a single one would be a chain of additions.
@@ -111,7 +111,7 @@ def _sum_in_lanes(count: int, product: str) -> str:
 
 
 def _sum_rgb_snippet(points: int) -> str:
-    summed = _sum_in_lanes(points, f"a[i + lane] * rgb[channel * {points} + i + lane]")
+    summed = sum_in_lanes(points, f"a[i + lane] * rgb[channel * {points} + i + lane]")
     return f"""
     wp::vec_t<3, float> result;
     for (int channel = 0; channel < 3; ++channel) {{ {summed} result[channel] = sums[0]; }}
@@ -122,7 +122,7 @@ def _sum_rgb_snippet(points: int) -> str:
 def project_snippet(coefficients: int, points: int) -> str:
     half = points // 2
     parts = {
-        parity: _sum_in_lanes(half, f"{parity}[i + lane] * rows.data[k][i + lane]") + "result[k] = sums[0];"
+        parity: sum_in_lanes(half, f"{parity}[i + lane] * rows.data[k][i + lane]") + "result[k] = sums[0];"
         for parity in ("even", "odd")
     }
     odd = ", ".join("true" if math.isqrt(k) % 2 else "false" for k in range(coefficients))

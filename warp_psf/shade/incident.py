@@ -99,14 +99,19 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         n = receivers.normal[world, slot]
         sources = between.find_sources(world, own, p, n, threshold, geometry, poses, patches, o)
         covers = between.lists()
+        # All pixels around a probe on a flat face have its normal; on round bodies they do not.
+        gain = between.numbers()
         for place in range(sources.count):
             covered = kit.covered_by(world, sources.entity[place], p, geometry, poses, o)
             covers[place] = sources.weight[place] * covered
+            gain[place] = 1.0
+            if patches.first_face[own] >= 0:
+                gain[place] = between.horizon_gain(covered, n, lighting.weights[0], o.quadrature)
         incident = kit.rgb_values()
         for place in range(sources.count):
             source = sources.entity[place]
             if bodies.field[source] >= 0:
-                passed = values(sources.weight[place])
+                passed = values(gain[place] * sources.weight[place])
                 for other in range(sources.count):
                     if other != place:
                         share = between.hides_body(world, sources, other, place, p, geometry, poses, patches)
