@@ -200,6 +200,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         if own < 0:
             return
         irradiance = wp.vec3()
+        normal = proxies.normal[world, proxy]
         for place in range(kept.count[world, station]):
             received = kept.irradiance[world, station, place]
             source = kept.entity[world, station, place]
@@ -213,7 +214,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             slab = patches.entity[seen]
             to_slab = slab_from_world(world, slab, poses, patches)
             p_slab = to_slab * (proxies.position[world, proxy] - slab_origin(world, slab, poses, patches))
-            shown = patch.face_radiance(world, seen, p_slab, to_slab, patches, o.quadrature)
+            shown = patch.face_radiance(world, seen, p_slab, normal, to_slab, patches, o.quadrature)
             irradiance += kit.sum_rgb(kept.transport[world, station, place], shown)
         if bodies.field[own] >= 0:
             from_itself = bodies.own[proxy]

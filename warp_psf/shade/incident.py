@@ -140,7 +140,7 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
                                 share = hides_face(world, sources.entity[other], face, p, geometry, poses, patches)
                                 if share > 0.0:
                                     passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                        radiance = patch.face_radiance(world, face, p_slab, to_slab, patches, o.quadrature)
+                        radiance = patch.face_radiance(world, face, p_slab, n, to_slab, patches, o.quadrature)
                         incident = add_products(incident, radiance, passed)
         for channel in range(3):
             weighted = weigh_channel(incident, channel, lighting.weights[0])

@@ -295,6 +295,7 @@ def make_patches(order: int) -> SimpleNamespace:
     @wp.func_native(_radiance_snippet(kit.points))
     def look_up_directions(
         p: wp.vec3,
+        n: wp.vec3,
         to_face: wp.mat33,
         half: wp.vec3,
         size: wp.vec2i,
@@ -343,11 +344,15 @@ def make_patches(order: int) -> SimpleNamespace:
         world: int,
         face: int,
         p_slab: wp.vec3,
+        n: wp.vec3,
         to_slab: wp.mat33,
         patches: PatchTable,
         quadrature: wp.array(dtype=half_values),
     ) -> rgb_values:
-        """The radiance of a face in every direction from a point of the slab's frame; to_slab: slab_from_world."""
+        """The radiance of a face in every direction from a point of the slab's frame, with normal n in the world.
+
+        to_slab: slab_from_world.
+        """
         axis = patches.axis[face]
         side = patches.side[face]
         half = patches.half[face]
@@ -361,6 +366,7 @@ def make_patches(order: int) -> SimpleNamespace:
         size = patches.size[face]
         return look_up_directions(
             p,
+            n,
             to_face,
             wp.vec3(wp.max(part[1], 1.0e-9), wp.max(part[3], 1.0e-9), 0.0),
             size,
@@ -377,8 +383,10 @@ def make_patches(order: int) -> SimpleNamespace:
 def _radiance_snippet(points: int) -> str:
     """C++: where each direction meets the face, then what the pyramid holds there.
 
-    Of two antipodes one meets the plane of the face. The other sees none of it but for the ringing of its
-    band-limited coverage, and gets the mean. A direction that passes by gets the nearest of the rim.
+    Directions that do not meet the face's plane see none of it but for the ringing of its band-limited coverage, and
+    get the mean; one that passes by the face gets the nearest of the rim. From below the receiver's horizon nothing is
+    received but for the ringing of its band-limited cosine, which is to ring with the radiance above the horizon: such
+    directions are mirrored.
     """
     half = points // 2
     # Seen under the cosine c at the distance t a solid angle covers t^2 / c times as much of the face.
@@ -389,17 +397,26 @@ def _radiance_snippet(points: int) -> str:
     const float scale_u = 1.0f / ((half[0] - focus[0]) / (focus[1] + ::fabsf(half[0] - focus[0])) - low_u);
     const float scale_v = 1.0f / ((half[1] - focus[2]) / (focus[3] + ::fabsf(half[1] - focus[2])) - low_v);
     const float texels_per_area = focus[1] * scale_u * size[0] * focus[3] * scale_v * size[1];
-    float place_u[{half}], place_v[{half}], level_at[{half}];
-    int meets[{half}];
-    for (int i = 0; i < {half}; ++i) {{
-        const float x = quadrature.data[0][i], y = quadrature.data[1][i], z = quadrature.data[2][i];
-        const float du = to_face.data[0][0] * x + to_face.data[0][1] * y + to_face.data[0][2] * z;
-        const float dv = to_face.data[1][0] * x + to_face.data[1][1] * y + to_face.data[1][2] * z;
-        const float dn = to_face.data[2][0] * x + to_face.data[2][1] * y + to_face.data[2][2] * z;
-        const float steep = dn < 0.0f ? -dn : dn;
-        const float cosine = steep > 1.0e-4f ? steep : 1.0e-4f;
-        const float t = p[2] / cosine, along = dn < 0.0f ? t : -t;
-        float u = p[0] + along * du, v = p[1] + along * dv;
+    // The receiver's normal, about the axes of the face.
+    const float nu = to_face.data[0][0] * n[0] + to_face.data[0][1] * n[1] + to_face.data[0][2] * n[2];
+    const float nv = to_face.data[1][0] * n[0] + to_face.data[1][1] * n[1] + to_face.data[1][2] * n[2];
+    const float nn = to_face.data[2][0] * n[0] + to_face.data[2][1] * n[1] + to_face.data[2][2] * n[2];
+    float place_u[{points}], place_v[{points}], level_at[{points}];
+    for (int i = 0; i < {points}; ++i) {{
+        const int j = i < {half} ? i : i - {half};
+        const float sign = i < {half} ? 1.0f : -1.0f;
+        const float x = sign * quadrature.data[0][j], y = sign * quadrature.data[1][j], z = sign * quadrature.data[2][j];
+        float du = to_face.data[0][0] * x + to_face.data[0][1] * y + to_face.data[0][2] * z;
+        float dv = to_face.data[1][0] * x + to_face.data[1][1] * y + to_face.data[1][2] * z;
+        float dn = to_face.data[2][0] * x + to_face.data[2][1] * y + to_face.data[2][2] * z;
+        const float ahead = du * nu + dv * nv + dn * nn, back = ahead < 0.0f ? 2.0f * ahead : 0.0f;
+        du -= back * nu;
+        dv -= back * nv;
+        dn -= back * nn;
+        const float steep = dn < 0.0f ? -dn : 0.0f;
+        const float cosine = steep > 1.0e-3f ? steep : 1.0e-3f;
+        const float t = p[2] / cosine;
+        float u = p[0] + t * du, v = p[1] + t * dv;
         u = u < -half[0] ? -half[0] : (u > half[0] ? half[0] : u);
         v = v < -half[1] ? -half[1] : (v > half[1] ? half[1] : v);
         const float off_u = u - focus[0], off_v = v - focus[2];
@@ -412,8 +429,7 @@ def _radiance_snippet(points: int) -> str:
         // Half the binary logarithm of the texels covered, its fraction taken as linear.
         union {{ float number; int bits; }} both;
         both.number = covered < 1.0f ? 1.0f : covered;
-        level_at[i] = 0.5f * ((float)(both.bits - 0x3f800000) * {2.0**-23:.9e}f);
-        meets[i] = dn < 0.0f ? i : {half} + i;
+        level_at[i] = dn < 0.0f ? 0.5f * ((float)(both.bits - 0x3f800000) * {2.0**-23:.9e}f) : -1.0f;
     }}
     int starts[16];
     starts[0] = first;
@@ -423,7 +439,11 @@ def _radiance_snippet(points: int) -> str:
     }}
     const auto& mean = texels.data[starts[levels - 1]];
     wp::vec_t<{3 * points}, float> all;
-    for (int i = 0; i < {half}; ++i) {{
+    for (int i = 0; i < {points}; ++i) {{
+        if (level_at[i] < 0.0f) {{
+            for (int c = 0; c < 3; ++c) all[c * {points} + i] = mean[c];
+            continue;
+        }}
         const float last = (float)(levels - 1), wanted = level_at[i] < last ? level_at[i] : last;
         const int fine = (int)wanted;
         const float share = wanted - (float)fine;
@@ -446,11 +466,7 @@ def _radiance_snippet(points: int) -> str:
                     + a * texel[top * width + right][c]) + b * ((1.0f - a) * texel[below * width + left][c]
                     + a * texel[below * width + right][c]));
         }}
-        const int toward = meets[i], away = toward < {half} ? toward + {half} : toward - {half};
-        for (int c = 0; c < 3; ++c) {{
-            all[c * {points} + toward] = sum[c];
-            all[c * {points} + away] = mean[c];
-        }}
+        for (int c = 0; c < 3; ++c) all[c * {points} + i] = sum[c];
     }}
     return all;
     """
