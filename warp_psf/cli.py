@@ -31,7 +31,7 @@ NO_ENVIRONMENT = "none"
 
 app = typer.Typer(
     name="warp-psf",
-    help="Soft shadows for MuJoCo simulations, without noise.",
+    help="Soft shadows and bounced light for MuJoCo simulations, without noise.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -52,15 +52,14 @@ class Options:
         str | None, typer.Option(metavar="E", help=f"Built-in name, EXR or HDR file, or '{NO_ENVIRONMENT}'.")
     ] = None
     order: Annotated[int, typer.Option(min=2, max=6, help="Bands of spherical harmonics.")] = 4
+    bounces: Annotated[int, typer.Option(min=0, max=16, metavar="N", help="Of light between bodies; 0: none.")] = 3
     shading: Annotated[str, typer.Option(metavar="pixel|vertex", help="Where light is computed.")] = "pixel"
     exposure: Annotated[float, typer.Option(metavar="STOPS", help="Brightness of PNG and MP4.")] = 0.0
     view: Annotated[str, typer.Option(metavar="neutral|srgb", help="View transform of PNG and MP4.")] = "neutral"
     device: Annotated[str | None, typer.Option(metavar="D", help="cpu, cuda:0, ...; default: the first GPU.")] = None
     formats: Annotated[str, typer.Option(metavar="LIST", help="Some of exr, png, mp4.")] = "exr,png,mp4"
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Render again what the folder holds.")] = False
-    model_lights: Annotated[
-        bool, typer.Option("--model-lights/--no-model-lights", help="Use the lights that the model brings.")
-    ] = True
+    model_lights: Annotated[bool, typer.Option(help="Use the lights that the model brings.")] = True
 
 
 def main() -> None:
@@ -116,8 +115,8 @@ def render_frames(
     chosen_camera = options.camera or camera or -1
     if options.environment is not None:
         environment = None if options.environment == NO_ENVIRONMENT else options.environment
-    same = {"order": options.order, "shading": options.shading, "model_lights": options.model_lights}
-    same |= {"exposure": options.exposure, "view": options.view}
+    shared = ("order", "bounces", "shading", "model_lights", "exposure", "view")
+    same = {option: getattr(options, option) for option in shared}
     # What a frame's pixels depend on. The device is not among it: a run may move to another machine.
     settings = same | {
         "model": f"{name} {fingerprint(model)}",
@@ -224,27 +223,33 @@ def bake(
     order: Annotated[int, typer.Option(min=2, max=6, help="Bands of spherical harmonics.")] = 4,
     device: Annotated[str | None, typer.Option(metavar="D", help="cpu, cuda:0, ...")] = None,
 ) -> None:
-    """Bakes the shadow fields of a model or a mesh into the cache, and says what they cost."""
+    """Bakes the fields of shadows and of bounced light into the cache, for a model or a mesh, and says what they cost."""
     with _one_sentence("stopped; run again to resume"):
-        from warp_psf.bake import bake_mesh
+        from warp_psf.bake import bake_mesh, bake_radiance
+        from warp_psf.bake.bodies import is_patch
         from warp_psf.device import find_device
         from warp_psf.field.shells import FINEST_RESOLUTION, SHELL_COUNT
+        from warp_psf.scene.detail import refine_radiating
 
-        chosen_device = str(find_device(device))
+        where = str(find_device(device))
         meshes = _load_meshes(source)
         rows = []
         with _progress_bar() as bar:
             show = _show_on(bar)
             for mesh in meshes:
                 start = time.perf_counter()
-                field = bake_mesh(mesh, order, device=chosen_device, progress=partial(show, mesh.name)).field
-                seconds = time.perf_counter() - start
-                size, saving = "closed form", ""
+                field = bake_mesh(mesh, order, device=where, progress=partial(show, mesh.name)).field
+                size, saving, light = "closed form", "", "textures"
                 if field is not None:
                     size = f"{field.nbytes:,}"
                     saving = f"{1.0 - field.nbytes / (SHELL_COUNT * FINEST_RESOLUTION**2 * order**2):.0%}"
-                rows.append((mesh.name, f"{len(mesh.vertices):,}", f"{seconds:.1f}", size, saving))
-        _print_table(("mesh", "vertices", "seconds", "field bytes", "adaptive saving"), rows)
+                if not is_patch(mesh):
+                    progress = partial(show, f"light of {mesh.name}")
+                    radiating = bake_radiance(refine_radiating(mesh), order, device=where, progress=progress)
+                    light = f"{radiating.field.nbytes:,}"
+                seconds = f"{time.perf_counter() - start:.1f}"
+                rows.append((mesh.name, f"{len(mesh.vertices):,}", seconds, size, saving, light))
+        _print_table(("mesh", "vertices", "seconds", "shadow bytes", "adaptive saving", "light bytes"), rows)
 
 
 @app.command()

@@ -11,26 +11,26 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from warp_psf.bake import BakedBody, bake_mesh, bake_radiance_field
-from warp_psf.bake.radiance import BakedRadiance, bake_radiance
+from warp_psf.bake import BakedBody, bake_radiance_field
+from warp_psf.bake.bodies import bake_bodies, bake_light
 from warp_psf.bridge import build_scene, read_camera, read_delta_lights, read_poses
 from warp_psf.device import find_device
 from warp_psf.field.radiance import FUNCTION_COUNTS
 from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
 from warp_psf.film.primary import EXTRA_GROUPS, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import make_film, read_layers, resolve_pixels
-from warp_psf.scene.detail import refine_flat_bodies, refine_radiating
+from warp_psf.scene.detail import refine_flat_bodies
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.geometry import upload_scene, write_poses
 from warp_psf.scene.light import Light, area_light_entities
-from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Poses
-from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances, upload_bounces
+from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
 from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
 from warp_psf.shade.lattice import STRIDES, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occlude import turn_occlusion, upload_occlusion
 from warp_psf.shade.probes import LastGather, gather_last_bounce, make_last_gather
+from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
 
 ORDERS = (2, 3, 4, 5, 6)
@@ -39,9 +39,6 @@ SHADINGS = ("pixel", "vertex")
 MOST_PIXELS = 2**27
 # After so many bounces between white walls a fiftieth of the light is left.
 MOST_BOUNCES = 16
-# Boxes whose shortest side is less than this share of the longest are floors, walls and beams: shells around their
-# centre would serve badly what lies on them.
-THICK = 0.25
 # Shadow rays towards directional lights end after this many extents of the model.
 DIRECTIONAL_REACH = 1000.0
 Progress = Callable[[str, float], None]
@@ -111,7 +108,10 @@ class Renderer:
         if shading == "vertex":
             self._scene = refine_flat_bodies(self._scene)
         report = progress or (lambda what, share: None)
-        self._upload(self._bake(report))
+        lamps = len(area_light_entities(self._scene))
+        entities = len(self._scene.entities)
+        self._casts = [entity < entities - lamps for entity in range(entities)]
+        self._upload(bake_bodies(self._scene, self._casts, self._order, str(self._device), report))
         self._bounces = self._last_gather = None
         if self._bounce_count:
             self._upload_bounces(int(basis_functions), report)
@@ -152,6 +152,11 @@ class Renderer:
     def occluders(self) -> int:
         """How many entities cast shadows."""
         return sum(self._casts)
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """What is baked and kept for this scene, bytes: `occlusion` fields, `transfer`, basis `radiance` fields."""
+        return dict(self._field_bytes)
 
     @property
     def vertices(self) -> int:
@@ -213,10 +218,10 @@ class Renderer:
     def layers(self) -> dict[str, np.ndarray]:
         """The layers of the last `update_scene`, as arrays of their own.
 
-        `color`: radiance with background and luminous surfaces; `direct`: the part that lights and environment cause
-        by one reflection; `indirect`: the part that came by other bodies; `albedo`; `normal` in the world: all float32 [height, width, 3], scene-linear. `depth`: metres along the optical axis, infinite where
-        nothing is, float32 [height, width]. `segmentation`: object id and type, -1 where nothing is, int32
-        [height, width, 2].
+        `color`: radiance with background and luminous surfaces; `direct`: what lights and environment cause by one
+        reflection; `indirect`: what came by other bodies; `albedo`; `normal` in the world: all float32 [height, width,
+        3], scene-linear. `depth`: metres along the optical axis, infinite where nothing is, float32 [height, width].
+        `segmentation`: object id and type, -1 where nothing is, int32 [height, width, 2].
         """
         self._draw()
         return read_layers(self._film)
@@ -256,22 +261,6 @@ class Renderer:
     def __reduce__(self) -> NoReturn:
         raise TypeError("a Renderer cannot be pickled or copied; make one in each process that renders")
 
-    def _bake(self, progress: Progress) -> list[BakedBody]:
-        """Every mesh's baked body; one that only area lights have neither casts nor receives shadows."""
-        entities, lights = self._scene.entities, area_light_entities(self._scene)
-        casters = {entity.mesh for entity in entities[: len(entities) - len(lights)]}
-        bodies = []
-        for index, mesh in enumerate(self._scene.meshes):
-            if index not in casters:
-                bodies.append(BakedBody(None, None, None))
-                continue
-
-            def report(share: float, name: str = mesh.name) -> None:
-                progress(f"baking {name}", share)
-
-            bodies.append(bake_mesh(mesh, self._order, device=str(self._device), progress=report))
-        return bodies
-
     def _upload(self, bodies: list[BakedBody]) -> None:
         scene, device, order = self._scene, self._device, self._order
         area_lights = area_light_entities(scene)
@@ -281,11 +270,16 @@ class Renderer:
             if light.mesh.slab is None and light.mesh.sphere is None:
                 radiance = np.ones(len(light.mesh.faces), np.float32)
                 fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
-        self._casts = [entity < len(scene.entities) - len(area_lights) for entity in range(len(scene.entities))]
         transfers = [
             None if body.transfer is None or body.visibility is None else (body.transfer, body.visibility)
             for body in bodies
         ]
+        stored = {id(field): field.nbytes for field in fields if field is not None}
+        self._field_bytes = {
+            "occlusion": sum(stored.values()),
+            "transfer": sum(pair[0].nbytes + pair[1].nbytes for pair in transfers if pair is not None),
+            "radiance": 0,
+        }
 
         self._device_scene = upload_scene(scene, 1, device)
         self._occlusion = upload_occlusion(scene, fields, self._casts, order, 1, device)
@@ -313,30 +307,11 @@ class Renderer:
     def _upload_bounces(self, functions: int, progress: Progress) -> None:
         """Bakes what leaves the bodies, and makes room for the bounces."""
         scene, device = self._scene, self._device
-        is_patch = [
-            casts and _is_patch(scene.meshes[e.mesh]) for e, casts in zip(scene.entities, self._casts, strict=True)
-        ]
-        radiating: dict[int, tuple[Mesh, BakedRadiance]] = {}
-        for entity, casts, flat in zip(scene.entities, self._casts, is_patch, strict=True):
-            if not casts or flat or entity.mesh in radiating:
-                continue
-            mesh = refine_radiating(scene.meshes[entity.mesh])
-
-            def report(share: float, name: str = mesh.name) -> None:
-                progress(f"baking light of {name}", share)
-
-            radiating[entity.mesh] = (
-                mesh,
-                bake_radiance(mesh, self._order, functions, device=str(device), progress=report),
-            )
-        of_entity = [
-            radiating[entity.mesh] if casts and not flat else None
-            for entity, casts, flat in zip(scene.entities, self._casts, is_patch, strict=True)
-        ]
-        self._bounces = upload_bounces(scene, of_entity, is_patch, self._occlusion, functions, 1, device)
-        slots = self._surfaces.slots
-        room = (self._bounce_threshold, self._width, self._height, slots)
+        radiating, flat = bake_light(scene, self._casts, self._order, functions, str(device), progress)
+        self._bounces = upload_bounces(scene, radiating, flat, self._occlusion, functions, 1, device)
+        room = (self._bounce_threshold, self._width, self._height, self._surfaces.slots)
         self._last_gather = make_last_gather(self._bounces, *room, device)
+        self._field_bytes["radiance"] = sum({id(b): b.field.nbytes for _, b in filter(None, radiating)}.values())
 
     def _make_received(self, count: int) -> tuple[wp.array, wp.array]:
         """Irradiance and Phong radiance of `count` receivers."""
@@ -429,11 +404,6 @@ def _check_model(model: mujoco.MjModel) -> None:
 
 def _same_poses(a: Poses, b: Poses | None) -> bool:
     return b is not None and np.array_equal(a.position, b.position) and np.array_equal(a.rotation, b.rotation)
-
-
-def _is_patch(mesh: Mesh) -> bool:
-    """Whether light leaves the shape through textured faces: what is flat or long, unlike a die."""
-    return mesh.slab is not None and mesh.slab[2].min() < THICK * mesh.slab[2].max()
 
 
 def _check_bounces(bounces: int, threshold: float, functions: int) -> None:

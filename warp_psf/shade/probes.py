@@ -269,20 +269,18 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
                 corners, weights = cell_of(world, slot, pixel, spacing, probes, receivers)
                 total = weights[0] + weights[1] + weights[2] + weights[3]
                 spacing = 2 * spacing
-            for corner in range(4):
-                if corners[corner] >= 0:
-                    share = weights[corner] / total
-                    diffuse += share * irradiance_of(light, corners[corner], response)
+            for place in range(4):
+                if corners[place] >= 0:
+                    share = weights[place] / total
+                    diffuse += share * irradiance_of(light, corners[place], response)
                     if is_glossy:
-                        glossy += share * irradiance_of(light, corners[corner], shine)
+                        glossy += share * irradiance_of(light, corners[place], shine)
         if own_first[entity] >= 0:
-            start = own_first[entity]
-            uv = surface.uv
-            from_itself = (
-                uv[0] * own_light[world, start + surface.corners[0]]
-                + uv[1] * own_light[world, start + surface.corners[1]]
-                + (1.0 - uv[0] - uv[1]) * own_light[world, start + surface.corners[2]]
-            )
+            corner = surface.corners + wp.vec3i(own_first[entity])
+            u = surface.uv[0]
+            v = surface.uv[1]
+            from_itself = u * own_light[world, corner[0]] + v * own_light[world, corner[1]]
+            from_itself += (1.0 - u - v) * own_light[world, corner[2]]
             diffuse += from_itself
             # Of what a body sends to itself only the sum is known, not where it comes from.
             glossy += from_itself / wp.pi
@@ -435,7 +433,8 @@ def _gather_chosen(
     device: wp.Device,
 ) -> None:
     """Makes probes of the chosen slots and gathers their light."""
-    state, kit = gather.bounces, make_probes(gather.bounces.order, gather.bounces.functions)
+    state = gather.bounces
+    kit = make_probes(state.order, state.functions)
     chosen, rank = gather.chosen.flatten(), gather.rank.flatten()
     wp.utils.array_scan(chosen, rank, inclusive=False)
     fresh = int(rank[-1:].numpy()[0] + chosen[-1:].numpy()[0])

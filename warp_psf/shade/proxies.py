@@ -1,0 +1,172 @@
+"""The proxies of a scene: the points at which the light that leaves its bodies is followed, and room for that light."""
+
+from types import SimpleNamespace
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_psf.field.radiance import BasisRadianceField, make_summed, upload_radiance
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.receiver import make_receivers
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.between import MOST_SOURCES
+from warp_psf.shade.bounce import BounceState, make_bounce
+from warp_psf.shade.occlude import OcclusionState
+from warp_psf.shade.patches import Patches, upload_patches
+
+# Proxies of one body, and of all bodies together: where there are many bodies, each gets fewer.
+MOST_PROXIES_PER_BODY = 192
+FEWEST_PROXIES_PER_BODY = 48
+MOST_PROXIES = 6144
+# Faces of slabs that a proxy keeps values of: three sides of a box can be seen at once.
+MOST_FACES = 24
+
+
+class Radiating(Protocol):
+    """What is baked of a body that sends out light; see `warp_psf.bake.radiance`."""
+
+    field: BasisRadianceField
+    proxies: np.ndarray
+    self_irradiance: np.ndarray | None
+
+    def solver(self, count: int) -> np.ndarray: ...
+
+
+def upload_bounces(
+    scene: Scene,
+    radiating: list[tuple[Mesh, Radiating] | None],
+    is_patch: list[bool],
+    occlusion: OcclusionState,
+    functions: int,
+    worlds: int,
+    device: wp.Device,
+) -> BounceState:
+    """Everything about bounces that does not change from frame to frame, with room for what does.
+
+    radiating: per entity the mesh whose vertices carry its basis functions, and what was baked of it; None for slabs
+    that are patches, and for lights. is_patch: per entity.
+    """
+    order = occlusion.order
+    kit = make_bounce(order, functions)
+    chosen = [entity for entity, pair in enumerate(radiating) if pair is not None]
+    fields = list({id(pair[1].field): pair[1].field for pair in radiating if pair is not None}.values())
+    number = {id(field): index for index, field in enumerate(fields)}
+    share = int(np.clip(MOST_PROXIES // max(len(chosen), 1), FEWEST_PROXIES_PER_BODY, MOST_PROXIES_PER_BODY))
+
+    field_of, counts, starts, solver_starts = (np.full(len(radiating), -1, np.int64) for _ in range(4))
+    points, normals, faces, corners, solvers, own, total, solved = [], [], [], [], [], [], 0, 0
+    for entity in chosen:
+        mesh, baked = radiating[entity]
+        vertices = baked.proxies[:share]
+        field_of[entity], counts[entity] = number[id(baked.field)], len(vertices)
+        starts[entity], solver_starts[entity] = total, solved
+        total, solved = total + len(vertices), solved + functions * len(vertices)
+        points.append(mesh.vertices[vertices])
+        normals.append(mesh.normals[vertices])
+        face_of, corner_of = _faces_of(mesh)
+        faces.append(face_of[vertices])
+        corners.append(corner_of[vertices])
+        solvers.append(baked.solver(len(vertices)).ravel())
+        from_itself = baked.self_irradiance
+        own.append(np.zeros((len(vertices), functions)) if from_itself is None else from_itself[vertices])
+
+    def upload(values, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=device)
+
+    def stack(parts: list, columns: int) -> np.ndarray:
+        return np.concatenate([np.zeros((0, columns), np.float32), *parts]).astype(np.float32)
+
+    bodies = kit.BodyTable()
+    bodies.field, bodies.proxies = upload(field_of, wp.int32), upload(counts, wp.int32)
+    bodies.first_proxy, bodies.first_solver = upload(starts, wp.int32), upload(solver_starts, wp.int32)
+    bodies.solver = upload(np.concatenate([np.zeros(1, np.float32)[:0], *solvers]), wp.float32)
+    bodies.own = upload(stack(own, functions), kit.radiant.weights)
+    shape = (worlds, len(radiating), 3)
+    weights = wp.zeros((*shape, functions), dtype=wp.float32, device=device)
+    bodies.weights = wp.array(ptr=weights.ptr, dtype=kit.radiant.weights, shape=shape, device=device, copy=False)
+
+    patches = upload_patches(scene, is_patch, occlusion, worlds, device)
+    slots = total + patches.texels
+    proxies = make_receivers((worlds, slots), device)
+    proxies.entity.fill_(-1)
+    face = np.concatenate([np.zeros(0, np.int32), *faces, np.zeros(patches.texels, np.int32)])
+    corner = np.concatenate([np.zeros(0, np.int32), *corners, np.zeros(patches.texels, np.int32)])
+    proxies.face.assign(np.repeat(face[None], worlds, axis=0).astype(np.int32))
+    uv = np.stack([corner == 0, corner == 1], axis=1).astype(np.float32)
+    proxies.uv.assign(np.repeat(uv[None], worlds, axis=0))
+    return BounceState(
+        order,
+        functions,
+        proxies,
+        upload(np.repeat(chosen, counts[chosen]) if chosen else np.zeros(0), wp.int32),
+        upload(stack(points, 3), wp.vec3),
+        upload(stack(normals, 3), wp.vec3),
+        bodies,
+        _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device),
+        upload_radiance(fields, order, functions, device),
+        patches,
+        weights,
+        wp.zeros((worlds, len(radiating), functions), dtype=wp.vec3, device=device),
+        make_summed([int(field) for field in field_of], fields, order, functions, worlds, device),
+        *_upload_own(radiating, functions, worlds, device),
+        wp.full((worlds, slots), 1, dtype=wp.int32, device=device),
+        tuple(wp.zeros((worlds, slots), dtype=wp.vec3, device=device) for _ in range(2)),
+        wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
+        wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
+    )
+
+
+def _upload_own(radiating: list, functions: int, worlds: int, device: wp.Device) -> tuple[wp.array, ...]:
+    """The vertices of bodies that send light to themselves: own_first, _entities, _rows, _functions and _light."""
+    first, entities, rows, tables = [], [], [], []
+    start_of: dict[int, int] = {}
+    total = stored = 0
+    for entity, pair in enumerate(radiating):
+        own = None if pair is None else pair[1].self_irradiance
+        first.append(-1 if own is None else total)
+        if own is None:
+            continue
+        if id(own) not in start_of:
+            start_of[id(own)] = stored
+            tables.append(own)
+            stored += len(own)
+        entities.append(np.full(len(own), entity))
+        rows.append(start_of[id(own)] + np.arange(len(own)))
+        total += len(own)
+    empty = np.zeros(0, np.int32)
+    weights = wp.types.vector(functions, wp.float32)
+    table = np.concatenate([np.zeros((0, functions), np.float32), *tables])
+    return (
+        wp.array(first, dtype=wp.int32, device=device),
+        wp.array(np.concatenate([empty, *entities]), dtype=wp.int32, device=device),
+        wp.array(np.concatenate([empty, *rows]), dtype=wp.int32, device=device),
+        wp.array(table, dtype=weights, device=device),
+        wp.zeros((worlds, total), dtype=wp.vec3, device=device),
+    )
+
+
+def _make_kept(
+    kit: SimpleNamespace, worlds: int, first_texel: int, patches: Patches, bodies: int, slabs: int, device: wp.Device
+):
+    places, faces = min(MOST_SOURCES, bodies), min(MOST_FACES, 3 * slabs)
+    stations = np.concatenate([np.arange(first_texel), first_texel + patches.stations])
+    shape = (worlds, len(stations))
+    kept = kit.KeptTable()
+    kept.proxy = wp.array(stations, dtype=wp.int32, device=device)
+    kept.count = wp.zeros(shape, dtype=wp.int32, device=device)
+    kept.entity = wp.zeros((*shape, places), dtype=wp.int32, device=device)
+    kept.irradiance = wp.zeros((*shape, places), dtype=kit.radiant.weights, device=device)
+    kept.face_count = wp.zeros(shape, dtype=wp.int32, device=device)
+    kept.face = wp.zeros((*shape, faces), dtype=wp.int32, device=device)
+    kept.transport = wp.zeros((*shape, faces), dtype=kit.values, device=device)
+    return kept
+
+
+def _faces_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """For every vertex one face that has it, and as which corner. The last face written wins; any will do."""
+    face_of, corner_of = np.zeros((2, len(mesh.vertices)), np.int32)
+    for corner in range(3):
+        face_of[mesh.faces[:, corner]] = np.arange(len(mesh.faces))
+        corner_of[mesh.faces[:, corner]] = corner
+    return face_of, corner_of
