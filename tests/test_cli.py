@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 import warp_psf
 from warp_psf import cli
-from warp_psf.film.writer import write_exr, write_png
+from warp_psf.film.writer import read_exr, write_exr, write_png
 
 MODEL = """
 <mujoco>
@@ -66,7 +66,7 @@ class FlatRenderer:
     def layers(self) -> dict[str, np.ndarray]:
         shape = (self.height, self.width)
         color = np.full((*shape, 3), self.level, np.float32)
-        layers = dict.fromkeys(("color", "direct", "indirect", "albedo", "normal"), color)
+        layers = dict.fromkeys(("color", "direct", "albedo", "normal"), color) | {"indirect": color / 4}
         return layers | {"depth": np.ones(shape, np.float32), "segmentation": np.zeros((*shape, 2), np.int32)}
 
 
@@ -114,17 +114,22 @@ def test_render_writes_every_frame_and_what_is_made_of_them(renderers, model_pat
     assert {"film.mp4", "contact_sheet.png"} <= names
     assert "4 frames rendered" in result.stdout
     assert "baking" not in result.stdout
+    layers = read_exr(out / "frame_0000.exr")
+    assert set(layers) == {"color", "direct", "indirect", "albedo", "normal", "depth", "segmentation"}
+    # The ball starts at 1 m; a quarter of that is exact in half floats.
+    assert (layers["direct"] == 1.0).all()
+    assert (layers["indirect"] == 0.25).all()
 
 
 def test_options_reach_the_renderer(renderers, model_path, tmp_path):
     flags = ("--environment", "none", "--order", 5, "--shading", "vertex", "--exposure", "-1.5", "--view", "srgb")
-    rest = ("--device", "cpu", "--no-model-lights", "--formats", "png", "--frames", "1:3")
+    rest = ("--device", "cpu", "--no-model-lights", "--formats", "png", "--frames", "1:3", "--bounces", 0)
     result = run("render", model_path, "--out", tmp_path / "out", *SMALL, *flags, *rest)
     assert result.exit_code == 0, result.output
     (renderer,) = renderers
     assert (renderer.width, renderer.height, renderer.pictures) == (32, 18, 2)
     expected = {"environment": None, "order": 5, "shading": "vertex", "exposure": -1.5, "view": "srgb"}
-    assert renderer.options == expected | {"device": "cpu", "model_lights": False, "lights": ()}
+    assert renderer.options == expected | {"device": "cpu", "model_lights": False, "lights": (), "bounces": 0}
     assert {"frame_0001.png", "frame_0002.png"} < set(files_of(tmp_path / "out"))
 
 
@@ -156,12 +161,21 @@ def test_other_settings_are_not_mixed_into_a_folder(renderers, model_path, tmp_p
     run("render", model_path, "--out", out, *SMALL)
     before = files_of(out)
     assert_refused(run("render", model_path, "--out", out, *SMALL, "--order", 3), "order")
+    assert_refused(run("render", model_path, "--out", out, *SMALL, "--bounces", 2), "bounces")
     model_path.write_text(MODEL.replace('pos="0 0 1"', 'pos="0 0 0.5"'))
     assert_refused(run("render", model_path, "--out", out, *SMALL), "model")
     assert files_of(out) == before
     replaced = run("render", model_path, "--out", out, *SMALL, "--overwrite")
     assert replaced.exit_code == 0, replaced.output
     assert files_of(out)["frame_0000.png"] != before["frame_0000.png"]
+
+
+@pytest.mark.parametrize("bounces", ["-1", "17", "1.5"])
+def test_bounces_are_a_whole_number_of_at_most_16(renderers, model_path, tmp_path, bounces):
+    result = run("render", model_path, "--out", tmp_path / "out", *SMALL, "--bounces", bounces)
+    assert result.exit_code == 2
+    assert "--bounces" in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -224,7 +238,8 @@ def test_simulations_share_the_options(renderers, tmp_path, monkeypatch, capsys)
     assert ending.value.code in (0, None), capsys.readouterr().err
     assert (tmp_path / "out" / "fall" / "frame_0002.png").exists()
     settings = json.loads((tmp_path / "out" / "fall" / "settings.json").read_text())["settings"]
-    assert (settings["camera"], settings["environment"]) == ("front", "studio")
+    assert (settings["camera"], settings["environment"], settings["bounces"]) == ("front", "studio", 3)
+    assert renderers[-1].options["bounces"] == 3
 
 
 def test_a_simulation_that_ends_early_says_so(renderers, tmp_path, monkeypatch, capsys):
@@ -297,12 +312,24 @@ def test_info_names_versions_and_the_cache(tmp_path, monkeypatch):
         assert word in result.stdout
 
 
-def test_bake_tells_what_needs_no_field(model_path, tmp_path, monkeypatch):
+def test_bake_leaves_nothing_for_the_renderer_to_bake(model_path, tmp_path, monkeypatch):
     monkeypatch.setenv("WARP_PSF_CACHE", str(tmp_path / "cache"))
     result = run("bake", model_path)
     assert result.exit_code == 0, result.output
-    assert result.stdout.count("closed form") == 2
     assert "adaptive saving" in result.stdout
+    lines = [line.strip("│").split("│") for line in result.stdout.splitlines() if line.startswith("│")]
+    rows = {name.strip(): [cell.strip() for cell in cells] for name, *cells in lines}
+    assert rows["plane"][2] == rows["sphere"][2] == "closed form"
+    # While rendering, the light of the floor is kept in textures, and that of the ball on shells around it.
+    assert rows["plane"][-1] == "textures"
+    light_bytes = int(rows["sphere"][-1].replace(",", ""))
+
+    shares = []
+    model = mujoco.MjModel.from_xml_path(str(model_path))
+    with warp_psf.Renderer(model, 18, 32, progress=lambda what, share: shares.append(share)) as renderer:
+        assert renderer.field_bytes["radiance"] == light_bytes > 0
+    # What is read from the cache is finished when it is first reported.
+    assert set(shares) == {1.0}
 
 
 def test_bake_names_a_mesh_that_is_not_there(tmp_path):

@@ -52,7 +52,7 @@ class Options:
         str | None, typer.Option(metavar="E", help=f"Built-in name, EXR or HDR file, or '{NO_ENVIRONMENT}'.")
     ] = None
     order: Annotated[int, typer.Option(min=2, max=6, help="Bands of spherical harmonics.")] = 4
-    bounces: Annotated[int, typer.Option(min=0, max=16, metavar="N", help="Of light between bodies; 0: none.")] = 3
+    bounces: Annotated[int, typer.Option(min=0, max=16, metavar="N", help="Bounces between bodies; 0 is none.")] = 3
     shading: Annotated[str, typer.Option(metavar="pixel|vertex", help="Where light is computed.")] = "pixel"
     exposure: Annotated[float, typer.Option(metavar="STOPS", help="Brightness of PNG and MP4.")] = 0.0
     view: Annotated[str, typer.Option(metavar="neutral|srgb", help="View transform of PNG and MP4.")] = "neutral"
@@ -147,8 +147,7 @@ def _render_missing(sequence: Any, stream: Iterator[Any], renderer: Any, camera:
     """Steps the simulation up to the last missing frame, renders and writes the missing ones, and counts them."""
     missing = [index for index in sequence.frames if sequence.missing(index)]
     task = bar.add_task("Frames", total=len(missing), rate="")
-    start = time.perf_counter()
-    done = 0
+    start, done = time.perf_counter(), 0
     # Frames that are there already are simulated all the same: the ones after them depend on their state.
     for index, data in zip(range(missing[-1] + 1 if missing else 0), stream, strict=False):
         if index == missing[done]:
@@ -223,7 +222,7 @@ def bake(
     order: Annotated[int, typer.Option(min=2, max=6, help="Bands of spherical harmonics.")] = 4,
     device: Annotated[str | None, typer.Option(metavar="D", help="cpu, cuda:0, ...")] = None,
 ) -> None:
-    """Bakes the fields of shadows and of bounced light into the cache, for a model or a mesh, and says what they cost."""
+    """Bakes the fields of a model or a mesh, for shadows and bounced light, into the cache, and says what they cost."""
     with _one_sentence("stopped; run again to resume"):
         from warp_psf.bake import bake_mesh, bake_radiance
         from warp_psf.bake.bodies import is_patch
@@ -231,8 +230,7 @@ def bake(
         from warp_psf.field.shells import FINEST_RESOLUTION, SHELL_COUNT
         from warp_psf.scene.detail import refine_radiating
 
-        where = str(find_device(device))
-        meshes = _load_meshes(source)
+        where, meshes = str(find_device(device)), _load_meshes(source)
         rows = []
         with _progress_bar() as bar:
             show = _show_on(bar)
@@ -247,8 +245,8 @@ def bake(
                     progress = partial(show, f"light of {mesh.name}")
                     radiating = bake_radiance(refine_radiating(mesh), order, device=where, progress=progress)
                     light = f"{radiating.field.nbytes:,}"
-                seconds = f"{time.perf_counter() - start:.1f}"
-                rows.append((mesh.name, f"{len(mesh.vertices):,}", seconds, size, saving, light))
+                seconds = time.perf_counter() - start
+                rows.append((mesh.name, f"{len(mesh.vertices):,}", f"{seconds:.1f}", size, saving, light))
         _print_table(("mesh", "vertices", "seconds", "shadow bytes", "adaptive saving", "light bytes"), rows)
 
 
@@ -299,9 +297,8 @@ def info() -> None:
         lines = {"Python": platform.python_version()}
         for package in ("warp-psf", "warp-lang", "mujoco", "numpy", "trimesh", "OpenEXR", "av"):
             lines[package] = version(package)
-        default = find_device()
         lines["devices"] = ", ".join(f"{device} ({device.name})" for device in wp.get_devices())
-        lines["default device"] = str(default)
+        lines["default device"] = str(find_device())
         lines["CPU cores"] = str(core_count())
         folder = Path(cache_folder())
         sizes = [entry.stat().st_size for entry in folder.rglob("*") if entry.is_file()]
@@ -370,9 +367,7 @@ def parse_frames(text: str | None, frames_per_second: int, duration: float) -> r
     if first >= last:
         raise ValueError(f"--frames {text} holds no frame: the first number must be below the second ({last})")
     if last > MOST_FRAMES:
-        raise ValueError(
-            f"frame {last - 1} is beyond the last possible one, {MOST_FRAMES - 1}: lower --frames or --duration"
-        )
+        raise ValueError(f"frame {last - 1} is beyond the last one, {MOST_FRAMES - 1}: lower --frames or --duration")
     return range(first, last)
 
 

@@ -17,7 +17,8 @@ from warp_psf.shade.area import make_area
 from warp_psf.shade.direct import legendre_series
 from warp_psf.shade.directions import sum_in_lanes
 from warp_psf.shade.occlude import make_occlude
-from warp_psf.shade.patches import PatchTable, axis_vector, slab_from_world, slab_origin
+from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
+from warp_psf.shade.relations import faces_ahead
 
 # As many bodies send light to a receiver at once; where there are more, those that take up least of its view fade out.
 MOST_SOURCES = 24
@@ -26,107 +27,17 @@ MOST_GAIN = 1.5
 # Two bounding spheres whose cones overlap by this share of the way from touching to standing behind one another hide
 # one another as far as their distances say; towards touching that fades.
 TOUCHING = 0.25
-# The least half-extent over which a body passes through a plane, in units of its bounding radius: a flat one is on one
-# side or the other.
-THINNEST = 1.0e-3
-
-
-@wp.struct
-class Extent:
-    """Where something lies in the world: within `radius` and the box of three half axes around `center`."""
-
-    center: wp.vec3
-    radius: wp.float32
-    axes: wp.mat33  # in columns
 
 
 @wp.func
-def extent_of(world: int, entity: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable) -> Extent:
-    """A slab's box, any other body's bounding sphere."""
-    extent = Extent()
-    extent.center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
-    if patches.first_face[entity] >= 0:
-        half = patches.slab_half[entity]
-        to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
-        extent.center = slab_origin(world, entity, poses, patches)
-        extent.axes = to_world * wp.diag(half)
-    else:
-        extent.radius = geometry.radius[entity]
-    return extent
-
-
-@wp.func
-def extent_of_face(world: int, face: int, poses: PoseTable, patches: PatchTable) -> Extent:
-    """The part of a face that sends out light."""
-    entity = patches.entity[face]
-    axis = patches.axis[face]
-    part = patches.part[world, face]
-    to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
-    u = axis_vector((axis + 1) % 3)
-    v = axis_vector((axis + 2) % 3)
-    middle = part[0] * u + part[2] * v + patches.side[face] * patches.half[face][2] * axis_vector(axis)
-    extent = Extent()
-    extent.center = slab_origin(world, entity, poses, patches) + to_world * middle
-    extent.axes = to_world * wp.diag(part[1] * u + part[3] * v)
-    return extent
-
-
-@wp.func
-def reach_of(extent: Extent, n: wp.vec3) -> float:
-    """How far an extent reaches from its centre along a direction, metres."""
-    along = wp.transpose(extent.axes) * n
-    return extent.radius + wp.abs(along[0]) + wp.abs(along[1]) + wp.abs(along[2])
-
-
-@wp.func
-def part_behind(extent: Extent, n: wp.vec3, height: float) -> float:
-    """The part of an extent behind a plane with normal n over which its centre stands at `height`, metres."""
-    size = extent.radius + wp.sqrt(
-        wp.length_sq(extent.axes[0]) + wp.length_sq(extent.axes[1]) + wp.length_sq(extent.axes[2])
-    )
-    return wp.clamp(0.5 - 0.5 * height / wp.max(reach_of(extent, n), wp.static(THINNEST) * size), 0.0, 1.0)
-
-
-@wp.func
-def behind_slab(world: int, slab: int, extent: Extent, p: wp.vec3, poses: PoseTable, patches: PatchTable) -> float:
-    """The part of an extent behind those faces of a slab before which p lies: only that can the slab hide."""
-    to_slab = slab_from_world(world, slab, poses, patches)
-    to_world = wp.transpose(to_slab)
-    origin = slab_origin(world, slab, poses, patches)
-    half = patches.slab_half[slab]
-    p_slab = to_slab * (p - origin)
-    center = to_slab * (extent.center - origin)
-    part = float(1.0)
-    for axis in range(3):
-        side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
-        if side * p_slab[axis] >= half[axis]:
-            n = side * (to_world * axis_vector(axis))
-            part = wp.min(part, part_behind(extent, n, side * center[axis] - half[axis]))
-    return part
-
-
-@wp.func
-def hides_face(
-    world: int,
-    occluder: int,
-    face: int,
-    p: wp.vec3,
-    geometry: GeometryTable,
-    poses: PoseTable,
-    patches: PatchTable,
-) -> float:
-    """How far an entity lies between p and a face of another: only what lies before the face does."""
-    entity = patches.entity[face]
-    n = patches.side[face] * (
-        wp.transpose(slab_from_world(world, entity, poses, patches)) * axis_vector(patches.axis[face])
-    )
-    extent = extent_of_face(world, face, poses, patches)
-    other = extent_of(world, occluder, geometry, poses, patches)
-    # What is half sunk into the face hides as much as its upper half does.
-    share = wp.min(2.0 - 2.0 * part_behind(other, n, wp.dot(n, other.center - extent.center)), 1.0)
-    if share > 0.0 and patches.first_face[occluder] >= 0:
-        share = wp.min(share, behind_slab(world, occluder, extent, p, poses, patches))
-    return share
+def overlap(toward: wp.vec3, sine: float, other_toward: wp.vec3, other_sine: float) -> float:
+    """How far the cones of two bounding spheres overlap: 0 not at all, 1 enough to hide one another."""
+    # What lies beside another hides nothing of it, although band-limited coverages overlap there.
+    if sine >= 1.0 or other_sine >= 1.0:
+        return 1.0
+    apart = wp.sqrt((1.0 - sine * sine) * (1.0 - other_sine * other_sine)) - sine * other_sine
+    together = wp.dot(toward, other_toward) - apart
+    return wp.clamp(together / (wp.static(TOUCHING) * wp.max(1.0 - apart, 1.0e-9)), 0.0, 1.0)
 
 
 @cache
@@ -161,6 +72,7 @@ def make_between(order: int) -> SimpleNamespace:
         distance: numbers  # to there, metres
         radius: numbers  # of the bounding spheres, metres
         sine: numbers  # of the angle that each spans, 1 from within
+        ahead: ids  # of a slab, the faces before which the receiver lies; see `faces_ahead`
 
     @wp.func
     def share_of(
@@ -243,6 +155,7 @@ def make_between(order: int) -> SimpleNamespace:
                 sources.distance[place] = distance
                 sources.radius[place] = geometry.radius[entity]
                 sources.sine[place] = wp.min(geometry.radius[entity] / distance, 1.0)
+                sources.ahead[place] = faces_ahead(world, entity, p, poses, patches)
                 sources.count = place + 1
         return sources
 
@@ -266,46 +179,13 @@ def make_between(order: int) -> SimpleNamespace:
         limited = disc_irradiance(x, squared, cosine)
         return wp.clamp(exact / wp.max(limited, 1.0e-9), 0.0, wp.static(MOST_GAIN))
 
-    @wp.func
-    def overlap(sources: Sources, a: int, b: int) -> float:
-        """How far the cones of two bounding spheres overlap: 0 not at all, 1 enough to hide one another."""
-        # What lies beside another hides nothing of it, although band-limited coverages overlap there.
-        sine_a = sources.sine[a]
-        sine_b = sources.sine[b]
-        if sine_a >= 1.0 or sine_b >= 1.0:
-            return 1.0
-        apart = wp.sqrt(1.0 - sine_a * sine_a) * wp.sqrt(1.0 - sine_b * sine_b) - sine_a * sine_b
-        cosine = wp.dot(sources.toward[a], sources.toward[b])
-        return wp.clamp((cosine - apart) / (wp.static(TOUCHING) * wp.max(1.0 - apart, 1.0e-9)), 0.0, 1.0)
-
-    @wp.func
-    def hides_body(
-        world: int,
-        sources: Sources,
-        other: int,
-        place: int,
-        p: wp.vec3,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        patches: PatchTable,
-    ) -> float:
-        """How far one source lies between p and another, which is no slab: 0 behind or beside it, 1 before it."""
-        share = overlap(sources, other, place)
-        if share > 0.0:
-            if patches.first_face[sources.entity[other]] >= 0:
-                extent = extent_of(world, sources.entity[place], geometry, poses, patches)
-                return share * behind_slab(world, sources.entity[other], extent, p, poses, patches)
-            further = sources.distance[place] - sources.distance[other]
-            share *= wp.clamp(0.5 + further / (sources.radius[place] + sources.radius[other]), 0.0, 1.0)
-        return share
-
     return SimpleNamespace(
         **vars(kit),
         lists=lists,
+        ids=ids,
         numbers=numbers,
         Sources=Sources,
         find_sources=find_sources,
-        hides_body=hides_body,
         horizon_gain=horizon_gain,
     )
 

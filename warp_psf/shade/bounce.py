@@ -21,7 +21,7 @@ from warp_psf.device import launch
 from warp_psf.field.radiance import SummedFields, make_radiance
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable
-from warp_psf.shade.between import hides_face, make_between
+from warp_psf.shade.between import make_between, overlap
 from warp_psf.shade.direct import DirectState, make_direct
 from warp_psf.shade.faces import make_faces
 from warp_psf.shade.occlude import OcclusionState
@@ -34,6 +34,7 @@ from warp_psf.shade.patches import (
     slab_from_world,
     slab_origin,
 )
+from warp_psf.shade.relations import RelationTable, hidden_part, hides_face, relate
 
 
 @cache
@@ -81,6 +82,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         o: Occlusion,
         lighting: Lighting,
         patches: PatchTable,
+        relations: RelationTable,
         fields: RadianceTable,
         bodies: BodyTable,
         threshold: float,
@@ -97,22 +99,36 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         transfer = kit.transfer_of(surface, o.rows[world, own], lighting, o)
         transfer = wp.cw_mul(transfer, lighting.weights[0])
         sources = between.find_sources(world, own, p, surface.normal, threshold, geometry, poses, patches, o)
+        entity_at = sources.entity
+        weight = sources.weight
+        toward = sources.toward
+        distance = sources.distance
+        radius = sources.radius
+        sine = sources.sine
+        ahead = sources.ahead
+        bodies_from = patches.entity.shape[0]
         covers = between.lists()
         gain = between.numbers()
         for place in range(sources.count):
-            covered = kit.covered_by(world, sources.entity[place], p, geometry, poses, o)
-            covers[place] = sources.weight[place] * covered
+            covered = kit.covered_by(world, entity_at[place], p, geometry, poses, o)
+            covers[place] = weight[place] * covered
             gain[place] = between.horizon_gain(covered, surface.normal, lighting.weights[0], o.quadrature)
         count = int(0)
         faces = int(0)
         for place in range(sources.count):
-            source = sources.entity[place]
-            weighted = sources.weight[place] * transfer
+            source = entity_at[place]
+            weighted = weight[place] * transfer
             if bodies.field[source] >= 0:
                 passed = values(1.0)
                 for other in range(sources.count):
                     if other != place:
-                        share = between.hides_body(world, sources, other, place, p, geometry, poses, patches)
+                        share = overlap(toward[other], sine[other], toward[place], sine[place])
+                        if share > 0.0 and ahead[other] > 0:
+                            first_face = patches.first_face[entity_at[other]]
+                            share *= hidden_part(world, bodies_from + source, first_face, ahead[other], relations)
+                        elif share > 0.0:
+                            further = distance[place] - distance[other]
+                            share *= wp.clamp(0.5 + further / (radius[place] + radius[other]), 0.0, 1.0)
                         if share > 0.0:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
@@ -130,7 +146,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                         passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o.quadrature)
                         for other in range(sources.count):
                             if other != place:
-                                share = hides_face(world, sources.entity[other], face, p, geometry, poses, patches)
+                                share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
                                 if share > 0.0:
                                     passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                         kept.face[world, station, faces] = face
@@ -311,6 +327,7 @@ class BounceState:
     kept: Any  # make_bounce(order, functions).KeptTable
     fields: Any  # make_radiance(order, functions).RadianceTable
     patches: Patches
+    relations: RelationTable
     weights: wp.array  # the memory behind bodies.weights, float32 (world, entity, channel, function)
     weights_rgb: wp.array  # the same, vec3 (world, entity, function)
     summed: SummedFields
@@ -347,8 +364,9 @@ def gather_basis_irradiances(
     inputs = [scene.poses, state.body_entities, state.body_points, state.body_normals, state.proxies]
     launch(_place_proxies, (worlds, state.first_texel), inputs, [], device)
     place_texels(state.patches, scene, state.proxies, state.first_texel, device)
-    tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.fields]
-    inputs = [state.proxies, *tables, state.bodies, threshold]
+    relate(state.relations, state.patches, scene, device)
+    tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.relations]
+    inputs = [state.proxies, *tables, state.fields, state.bodies, threshold]
     launch(kit.gather_basis, state.kept.count.shape, inputs, [state.kept], device)
 
 

@@ -14,10 +14,11 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.scene.geometry import GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable
-from warp_psf.shade.between import hides_face
+from warp_psf.shade.between import overlap
 from warp_psf.shade.bounce import make_bounce
 from warp_psf.shade.directions import make_directions, project_snippet
 from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
+from warp_psf.shade.relations import RelationTable, hidden_part, hides_face
 
 
 def wide_order(order: int) -> int:
@@ -81,6 +82,7 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         o: Occlusion,
         lighting: Lighting,
         patches: PatchTable,
+        relations: RelationTable,
         fields: radiant.RadianceTable,
         bodies: kit.BodyTable,
         summed: wp.array2d(dtype=radiant.rgb),  # (world, entity's sample)
@@ -98,23 +100,37 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         p = receivers.position[world, slot]
         n = receivers.normal[world, slot]
         sources = between.find_sources(world, own, p, n, threshold, geometry, poses, patches, o)
+        entity_at = sources.entity
+        weight = sources.weight
+        toward = sources.toward
+        distance = sources.distance
+        radius = sources.radius
+        sine = sources.sine
+        ahead = sources.ahead
+        bodies_from = patches.entity.shape[0]
         covers = between.lists()
         # All pixels around a probe on a flat face have its normal; on round bodies they do not.
         gain = between.numbers()
         for place in range(sources.count):
-            covered = kit.covered_by(world, sources.entity[place], p, geometry, poses, o)
-            covers[place] = sources.weight[place] * covered
+            covered = kit.covered_by(world, entity_at[place], p, geometry, poses, o)
+            covers[place] = weight[place] * covered
             gain[place] = 1.0
             if patches.first_face[own] >= 0:
                 gain[place] = between.horizon_gain(covered, n, lighting.weights[0], o.quadrature)
         incident = kit.rgb_values()
         for place in range(sources.count):
-            source = sources.entity[place]
+            source = entity_at[place]
             if bodies.field[source] >= 0:
-                passed = values(gain[place] * sources.weight[place])
+                passed = values(gain[place] * weight[place])
                 for other in range(sources.count):
                     if other != place:
-                        share = between.hides_body(world, sources, other, place, p, geometry, poses, patches)
+                        share = overlap(toward[other], sine[other], toward[place], sine[place])
+                        if share > 0.0 and ahead[other] > 0:
+                            first_face = patches.first_face[entity_at[other]]
+                            share *= hidden_part(world, bodies_from + source, first_face, ahead[other], relations)
+                        elif share > 0.0:
+                            further = distance[place] - distance[other]
+                            share *= wp.clamp(0.5 + further / (radius[place] + radius[other]), 0.0, 1.0)
                         if share > 0.0:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
@@ -134,10 +150,10 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
                     face = patches.first_face[source] + side
                     if patch.sees_face(world, face, p_slab, patches):
                         passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o.quadrature)
-                        passed = sources.weight[place] * passed
+                        passed = weight[place] * passed
                         for other in range(sources.count):
                             if other != place:
-                                share = hides_face(world, sources.entity[other], face, p, geometry, poses, patches)
+                                share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
                                 if share > 0.0:
                                     passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                         radiance = patch.face_radiance(world, face, p_slab, n, to_slab, patches, o.quadrature)

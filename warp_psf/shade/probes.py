@@ -446,6 +446,13 @@ def _gather_chosen(
         wp.copy(larger, gather.light, count=gather.light.size)
         gather.light = larger
     inputs = [gather.count, gather.table.slot, pixels, scene.geometry, scene.poses, occlusion.table, lighting.table]
-    inputs += [state.patches.table, state.fields, state.bodies, state.summed.summed, state.summed.first]
+    inputs += [
+        state.patches.table,
+        state.relations,
+        state.fields,
+        state.bodies,
+        state.summed.summed,
+        state.summed.first,
+    ]
     launch(kit.gather_incident, (1, fresh), [*inputs, gather.wide_rows, gather.threshold], [gather.light], device)
     gather.count += fresh

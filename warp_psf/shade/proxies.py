@@ -14,6 +14,7 @@ from warp_psf.shade.between import MOST_SOURCES
 from warp_psf.shade.bounce import BounceState, make_bounce
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.patches import Patches, upload_patches
+from warp_psf.shade.relations import make_relations
 
 # Proxies of one body, and of all bodies together: where there are many bodies, each gets fewer.
 MOST_PROXIES_PER_BODY = 192
@@ -106,6 +107,7 @@ def upload_bounces(
         _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device),
         upload_radiance(fields, order, functions, device),
         patches,
+        make_relations(patches, len(radiating), worlds, device),
         weights,
         wp.zeros((worlds, len(radiating), functions), dtype=wp.vec3, device=device),
         make_summed([int(field) for field in field_of], fields, order, functions, worlds, device),
