@@ -1,11 +1,15 @@
 """What a frame costs: `python -m benchmarks.frame`.
 
-Milliseconds per stage and per frame, nanoseconds per receiver and occluder, for bowling, falling and statues at 640x360
-and 1280x720, shaded at pixels and at vertices, in the light of the studio environment (`--lights` takes each scene's
-own environment and area lights). Every configuration runs in a process of its own, so that its peak memory is its own.
+Milliseconds per frame, for direct light, for bounced light and per stage, nanoseconds per receiver and occluder, and
+the bytes of the baked fields, for bowling, falling, statues and room (and teapots, where `--scenes` names it), at
+640x360 and 1280x720, shaded at pixels and at vertices. The light is that of the studio environment; `--lights` takes
+each scene's own environment and area lights, which closed rooms have in any case. In every measured frame the bodies
+have moved, so that nothing is kept from the frame before. Every configuration runs in a process of its own, so that its
+peak memory is its own.
 """
 
 import argparse
+import copy
 import importlib
 import json
 import resource
@@ -18,11 +22,14 @@ from pathlib import Path
 
 import warp_psf as psf
 
-SCENES = ("bowling", "falling", "statues")
+SCENES = ("bowling", "falling", "statues", "room")
 SIZES = ("640x360", "1280x720")
 SHADINGS = ("pixel", "vertex")
 # The frame whose cost is printed, in simulated seconds: the bodies are in motion and close to one another.
-MOMENTS = {"bowling": 1.2, "falling": 1.5, "statues": 1.0}
+MOMENTS = {"bowling": 1.2, "falling": 1.5, "statues": 1.0, "room": 1.0, "teapots": 1.0}
+# What the Renderer's stages are for; the others (primary visibility, display, ...) belong to neither.
+DIRECT = ("shadow fields", "shadow rays")
+BOUNCES = ("basis irradiances", "light on proxies", "bounces", "last gather")
 
 
 def measure(scene_name: str, size: str, shading: str, options: argparse.Namespace) -> dict:
@@ -30,10 +37,11 @@ def measure(scene_name: str, size: str, shading: str, options: argparse.Namespac
     scene = importlib.import_module(f"sims.{scene_name}")
     width, height = map(int, size.split("x"))
     model = scene.build()
-    # The last state; a deque of one forgets the others.
-    data = deque(scene.states(model, 30, MOMENTS[scene_name]), maxlen=1).pop()
-    lights = scene.lights() if options.lights else ()
-    environment = scene.environment() if options.lights else "studio"
+    # The last two states, between which every frame moves the bodies; the simulation yields one object again and again.
+    states = deque(map(copy.copy, scene.states(model, 30, MOMENTS[scene_name])), maxlen=2)
+    own_lights = options.lights or scene.environment() is None
+    lights = scene.lights() if own_lights else ()
+    environment = scene.environment() if own_lights else "studio"
     with psf.Renderer(
         model,
         height,
@@ -41,6 +49,7 @@ def measure(scene_name: str, size: str, shading: str, options: argparse.Namespac
         environment=environment,
         lights=lights,
         order=options.order,
+        bounces=options.bounces,
         shading=shading,
         model_lights=False,
         device=options.device,
@@ -48,25 +57,32 @@ def measure(scene_name: str, size: str, shading: str, options: argparse.Namespac
         frames, stages = [], []
         for _ in range(options.warmup + options.frames):
             start = time.perf_counter()
-            renderer.update_scene(data, camera="front")
+            renderer.update_scene(states[0], camera="front")
             renderer.render()
             frames.append(time.perf_counter() - start)
             stages.append(renderer.stage_seconds)
+            states.rotate()
         frames, stages = frames[options.warmup :], stages[options.warmup :]
         layers = renderer.layers()
         seen = int((layers["segmentation"][..., 0] >= 0).sum())
         receivers = seen if shading == "pixel" else renderer.vertices
-        occluders = renderer.occluders
+        occluders, field_bytes = renderer.occluders, renderer.field_bytes
     per_stage = {stage: statistics.median(found[stage] for found in stages) for stage in stages[0]}
+    direct, bounces = (sum(per_stage.get(stage, 0.0) for stage in group) for group in (DIRECT, BOUNCES))
     return {
         "scene": scene_name,
         "size": size,
         "shading": shading,
         "order": options.order,
+        "bounce_count": options.bounces,
         "frame": statistics.median(frames),
+        "direct": direct,
+        "bounces": bounces,
+        "ratio": bounces / direct,
         "stages": per_stage,
         "receivers": receivers,
         "occluders": occluders,
+        "field_bytes": field_bytes,
         "ns_per_receiver_and_occluder": 1e9 * per_stage["shadow fields"] / max(receivers * occluders, 1),
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
@@ -77,20 +93,29 @@ def print_row(found: dict) -> None:
     stages = "  ".join(f"{name} {1e3 * seconds:.1f}" for name, seconds in found["stages"].items())
     print(
         f"{found['scene']:9} {found['size']:>8} {found['shading']:6} {1e3 * found['frame']:8.1f} ms/frame "
+        f"{1e3 * found['direct']:7.1f} direct {1e3 * found['bounces']:7.1f} bounces {found['ratio']:5.2f} ratio "
         f"{found['ns_per_receiver_and_occluder']:7.1f} ns {found['receivers']:8} x {found['occluders']:2} "
         f"{found['peak_memory_bytes'] / 2**20:6.0f} MiB   {stages}",
         flush=True,
     )
 
 
+def print_fields(found: dict) -> None:
+    """What is baked for a scene, megabytes."""
+    sizes = found["field_bytes"]
+    parts = "  ".join(f"{name} {size / 1e6:.1f}" for name, size in sizes.items())
+    print(f"{found['scene']:9} fields, MB: {parts}  together {sum(sizes.values()) / 1e6:.1f}", flush=True)
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(MOMENTS))
     parser.add_argument("--sizes", nargs="+", default=list(SIZES))
     parser.add_argument("--shadings", nargs="+", default=list(SHADINGS))
     parser.add_argument("--order", type=int, default=4)
-    parser.add_argument("--lights", action="store_true", help="with the scene's area lights")
+    parser.add_argument("--bounces", type=int, default=3)
+    parser.add_argument("--lights", action="store_true", help="with the scene's own environment and area lights")
     parser.add_argument("--frames", type=int, default=7)
     parser.add_argument("--warmup", type=int, default=2)
     parser.add_argument("--device")
@@ -101,7 +126,8 @@ def main() -> None:
         print(json.dumps(measure(*options.only, options)))
         return
     rows = []
-    print("ns: of the stage `shadow fields`, on all cores together, per receiver and occluder; stages in ms")
+    print("ns: of the stage `shadow fields`, on all cores together, per receiver and occluder; the rest in ms")
+    print(f"direct: {' + '.join(DIRECT)}; bounces: {' + '.join(BOUNCES)}; ratio: of bounces to direct")
     for scene in options.scenes:
         for size in options.sizes:
             for shading in options.shadings:
@@ -109,6 +135,7 @@ def main() -> None:
                 output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
                 rows.append(json.loads(output.splitlines()[-1]))
                 print_row(rows[-1])
+        print_fields(rows[-1])
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1))
 
