@@ -27,9 +27,9 @@ from warp_psf.scene.scene import Poses
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
 from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
+from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.lattice import STRIDES, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occlude import turn_occlusion, upload_occlusion
-from warp_psf.shade.probes import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
 
@@ -361,7 +361,8 @@ class Renderer:
         with self._timed("last gather"):
             surfaces = self._surfaces
             seen = (surfaces.receivers, surfaces.extra, EXTRA_GROUPS)
-            gather_last_bounce(last_gather, *seen, scene, *lights, self._received[0], self._bounced, device)
+            direct = self._received[0]
+            gather_last_bounce(last_gather, *seen, scene, *lights, self._lattice, direct, self._bounced, device)
 
     def _shade_pixels(self) -> None:
         scene, device, pixels = self._device_scene, self._device, self._surfaces.receivers
@@ -382,6 +383,8 @@ class Renderer:
             shade_direct(vertices.receivers, self._vertices_turns, 1, scene, *lights, *received, device)
         with self._timed("interpolate vertices"):
             interpolate_vertices(vertices, pixels, scene, received, *self._received, device)
+        # Every pixel receives bounced light by itself.
+        self._lattice.turns.fill_(1)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

@@ -193,6 +193,53 @@ def _refine(
                     turns[world, pixel] = turn + 1
 
 
+@wp.kernel(enable_backward=False, module="unique")
+def _interpolate(
+    first: int,
+    receivers: ReceiverTable,
+    width: int,
+    height: int,
+    stride: int,
+    turns: wp.array2d(dtype=wp.int32),  # (world, slot)
+    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+):
+    world, pixel = wp.tid()
+    pixel += first
+    if turns[world, pixel] != wp.static(INTERPOLATED) or receivers.entity[world, pixel] < 0:
+        return
+    x = pixel % width
+    y = pixel / width
+    # In a wide cell that was refined the pixels half-way were shaded, unless it was smooth. Cells that the border cuts
+    # are always refined.
+    wide = wp.static(STRIDES[0])
+    half = wp.static(STRIDES[1])
+    left = x - x % wide
+    above = y - y % wide
+    is_wide = bool(False)
+    if left + wide < width and above + wide < height:
+        start = left + above * width
+        is_wide = (
+            turns[world, start + half] == wp.static(INTERPOLATED)
+            or turns[world, start + half * width] == wp.static(INTERPOLATED)
+            or turns[world, start + half * width + half] == wp.static(INTERPOLATED)
+        )
+    if is_wide != (stride == wide):
+        return
+    u = float(x % stride) / float(stride)
+    v = float(y % stride) / float(stride)
+    a = x - x % stride + (y - y % stride) * width
+    b = a + stride
+    c = a + stride * width
+    d = c + stride
+    diffuse[world, pixel] = (1.0 - v) * ((1.0 - u) * diffuse[world, a] + u * diffuse[world, b]) + v * (
+        (1.0 - u) * diffuse[world, c] + u * diffuse[world, d]
+    )
+    glossy[world, pixel] = (1.0 - v) * ((1.0 - u) * glossy[world, a] + u * glossy[world, b]) + v * (
+        (1.0 - u) * glossy[world, c] + u * glossy[world, d]
+    )
+
+
 def make_lattice(worlds: int, slots: int, width: int, height: int, device: wp.Device) -> Lattice:
     """Room for the turns of `slots` receivers per world, the first width x height of which are pixels."""
     return Lattice(wp.zeros((worlds, slots), dtype=wp.int32, device=device), width, height)
@@ -211,3 +258,13 @@ def refine_lattice(
     cells = -(-lattice.width // stride) * -(-lattice.height // stride)
     inputs = [receivers, lattice.width, lattice.height, turn, stride, lattice.turns, diffuse, glossy]
     launch(_refine, (lattice.turns.shape[0], cells), inputs, [], device)
+
+
+def interpolate_lattice(
+    lattice: Lattice, receivers: ReceiverTable, diffuse: wp.array, glossy: wp.array, device: wp.Device
+) -> None:
+    """Interpolates other values in the cells in which a refined lattice was interpolated."""
+    dim = (lattice.turns.shape[0], lattice.width * lattice.height)
+    for stride in STRIDES[:-1]:
+        inputs = [receivers, lattice.width, lattice.height, stride, lattice.turns, diffuse, glossy]
+        launch(_interpolate, dim, inputs, [], device)
