@@ -245,7 +245,8 @@ def test_a_body_out_of_reach_sends_nothing():
     apart = [np.abs(layers["indirect"] - alone["indirect"]).max(axis=2) for layers in (near, away)]
     # It takes up (0.35 m / 1 km)^2 of any view, far below the threshold. What differs is where texels lie.
     assert np.sqrt(np.mean(apart[1] ** 2)) < 0.015 * alone["indirect"].max()
-    assert np.quantile(apart[1], 0.95) < 0.03 * alone["indirect"].max() < 0.3 * np.quantile(apart[0], 0.95)
+    assert np.quantile(apart[1], 0.95) < 0.03 * alone["indirect"].max()
+    assert np.quantile(apart[0], 0.95) > 1.5 * np.quantile(apart[1], 0.95)
     for number in range(3):
         body = shown(alone, number)
         assert away["indirect"][body].mean() == pytest.approx(alone["indirect"][body].mean(), rel=0.03)

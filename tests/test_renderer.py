@@ -80,7 +80,7 @@ def test_depth_and_segmentation(scene):
 def test_layers(scene):
     renderer, _ = scene
     layers = renderer.layers()
-    assert list(layers) == ["color", "direct", "albedo", "normal", "depth", "segmentation"]
+    assert list(layers) == ["color", "direct", "indirect", "albedo", "normal", "depth", "segmentation"]
     for name in ("color", "direct", "albedo", "normal"):
         assert (layers[name].dtype, layers[name].shape) == (np.float32, (HEIGHT, WIDTH, 3))
         assert np.isfinite(layers[name]).all()
@@ -144,14 +144,22 @@ def test_cameras_by_id_name_and_object(scene):
 
 def test_stages_are_timed(scene):
     renderer, data = scene
-    renderer.update_scene(data, "front")
+    moved = mujoco.MjData(renderer.model)
+    moved.qpos[0] += 0.01
+    mujoco.mj_forward(renderer.model, moved)
+    renderer.update_scene(moved, "front")
     renderer.render()
     stages = renderer.stage_seconds
+    renderer.update_scene(data, "front")
     assert list(stages) == [
         "primary visibility",
         "turn fields",
         "shadow fields",
         "shadow rays",
+        "basis irradiances",
+        "light on proxies",
+        "bounces",
+        "last gather",
         "resolve pixels",
         "display",
     ]
@@ -174,13 +182,14 @@ def test_shapes_of_lights_are_not_baked_as_occluders(monkeypatch):
     told = []
     tube = psf.AreaLight("tube", primitives.capsule(0.4, 0.6), (1, 1, 1))
     renderer = psf.Renderer(model, 4, 4, lights=[tube], progress=lambda what, share: told.append(what))
-    assert set(told) == {"baking plane", "baking sphere", "baking box"}
+    light = {"baking light of sphere", "baking light of box"}
+    assert set(told) == {"baking plane", "baking sphere", "baking box"} | light
     assert renderer.occluders == 3
 
 
 def test_exposure_and_view():
     pictures = [
-        make_renderer(SCENE, 12, 16, exposure=exposure, view=view)[0].render().astype(int)
+        make_renderer(SCENE, 12, 16, exposure=exposure, view=view, bounces=0)[0].render().astype(int)
         for exposure, view in ((0, "neutral"), (1, "neutral"), (0, "srgb"))
     ]
     assert pictures[1].mean() > pictures[0].mean() + 20

@@ -218,12 +218,10 @@ def _interpolate(
     above = y - y % wide
     is_wide = bool(False)
     if left + wide < width and above + wide < height:
-        start = left + above * width
-        is_wide = (
-            turns[world, start + half] == wp.static(INTERPOLATED)
-            or turns[world, start + half * width] == wp.static(INTERPOLATED)
-            or turns[world, start + half * width + half] == wp.static(INTERPOLATED)
-        )
+        for place in range(3):
+            halfway = left + wp.where(place == 1, 0, half) + (above + wp.where(place == 2, 0, half)) * width
+            if turns[world, halfway] == wp.static(INTERPOLATED) and receivers.entity[world, halfway] >= 0:
+                is_wide = True
     if is_wide != (stride == wide):
         return
     u = float(x % stride) / float(stride)

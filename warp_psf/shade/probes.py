@@ -44,11 +44,9 @@ class ProbeTable:
 
 @cache
 def make_probes(order: int, functions: int) -> SimpleNamespace:
-    """The kernels that choose probes and receive their light; see `make_incident`."""
+    """The kernels that choose probes, and the functions that find those near a pixel; see `make_incident`."""
     kit = make_incident(order, functions)
-    wide, half_values = kit.wide, kit.half_values
-    Occlusion, Lighting = kit.Occlusion, kit.Lighting
-    response_of, to_sh = kit.response_of, kit.to_sh
+    wide, Lighting, response_of = kit.wide, kit.Lighting, kit.response_of
 
     @wp.func
     def affinity(receivers: ReceiverTable, world: int, slot: int, other: int) -> float:
