@@ -1,5 +1,6 @@
 # Sets itself up: needs only make and Python 3.11 or newer with its venv module.
 #   make bowling    ten pins and a ball: frames, film and contact sheet in out/bowling
+#                   (likewise falling, statues, room, teapots)
 #   make test       the tests            make check    ruff and pyright
 PYTHON ?= python3
 BIN := .venv/bin

@@ -50,7 +50,7 @@ def settle(name: str):
 def render(model, data, environment: psf.Environment, order: int, shading: str, size: tuple[int, int]) -> dict:
     """The layers of a frame in the environment's light alone, with the points that its pixels show."""
     with psf.Renderer(
-        model, size[1], size[0], environment=environment, order=order, shading=shading, model_lights=False
+        model, size[1], size[0], environment=environment, order=order, bounces=0, shading=shading, model_lights=False
     ) as renderer:
         renderer.update_scene(data, camera="front")
         layers = renderer.layers()

@@ -51,6 +51,16 @@ def assert_refused(action, error: type[Exception], *words: str) -> None:
         ({"view": "film"}, ("'film'", "'neutral' or 'srgb'")),
         ({"exposure": float("nan")}, ("exposure is nan",)),
         ({"exposure": 100}, ("exposure is 100", "64")),
+        ({"bounces": -1}, ("bounces is -1", "0 to 16")),
+        ({"bounces": 17}, ("bounces is 17", "0 to 16")),
+        ({"bounces": 2.5}, ("bounces is 2.5", "whole number")),
+        ({"bounces": float("nan")}, ("bounces is nan", "whole number")),
+        ({"bounces": float("inf")}, ("bounces is inf", "whole number")),
+        ({"bounce_threshold": 0.0}, ("bounce_threshold is 0.0", "between 0 and 1")),
+        ({"bounce_threshold": 1}, ("bounce_threshold is 1", "between 0 and 1")),
+        ({"bounce_threshold": float("nan")}, ("bounce_threshold is nan", "between 0 and 1")),
+        ({"basis_functions": 12}, ("basis_functions is 12", "4, 8, 16, 32")),
+        ({"basis_functions": 0}, ("basis_functions is 0", "4, 8, 16, 32")),
         ({"material_space": "rgb"}, ("'rgb'", "'srgb' or 'linear'")),
         ({"device": "cuda:97"}, ("cuda:97", "not on this machine", "cpu")),
         ({"device": "quantum"}, ("quantum", "not on this machine", "cpu")),
@@ -62,7 +72,7 @@ def test_bad_options(model, options, words):
 
 
 def test_whole_floats_are_whole_numbers(model):
-    renderer = psf.Renderer(model, 4.0, 6.0, order=4.0)  # as 0.5 * size gives them
+    renderer = psf.Renderer(model, 4.0, 6.0, order=4.0, bounces=2.0, basis_functions=16.0)  # as 0.5 * size gives them
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     renderer.update_scene(data)

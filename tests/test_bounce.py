@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import warp_psf as psf
+import warp_psf.renderer
 from sims import bodies
 from tests.oracles import make_renderer
 from tests.oracles_bounce import traced_bounces
-from warp_psf.shade import probes
+from warp_psf.shade import last_gather
 from warp_psf.shade.between import MOST_SOURCES
 
 HEIGHT, WIDTH = 32, 48
@@ -77,12 +78,18 @@ def draw(body: str, **options) -> dict[str, np.ndarray]:
     return start(body, **options)[0].layers()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def gather_at_every_pixel() -> Iterator[None]:
+def gather_everywhere(patch: pytest.MonkeyPatch) -> None:
+    """Makes every pixel a probe, and lets none be interpolated."""
     # The kernels take the spacings as they are when they are compiled, the first time that they run.
     draw(geom(BALL, "0 0 1", "pale") + geom(PILL, "0 1 1", "pale") + camera("0 -4 1", "1 0 0 0 0 1"))
+    patch.setattr(last_gather, "SPACINGS", (1,))
+    patch.setattr(warp_psf.renderer, "begin_lattice", lambda lattice, *_: lattice.turns.fill_(1))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def at_every_pixel() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(probes, "SPACINGS", (1,))
+        gather_everywhere(patch)
         yield
 
 

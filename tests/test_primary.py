@@ -218,7 +218,8 @@ def test_edges_blend_with_the_background():
     white = np.full((4, 8, 3), 2.0)
     renderer, _, layers = picture(SCENE, "front", environment=white)
     outside = 1 - weights_of(renderer).reshape(HEIGHT, WIDTH)
-    np.testing.assert_allclose(layers["color"] - layers["direct"], 2 * outside[..., None] * np.ones(3), atol=1e-5)
+    light = layers["direct"] + layers["indirect"]
+    np.testing.assert_allclose(layers["color"] - light, 2 * outside[..., None] * np.ones(3), atol=1e-5)
     assert ((outside > 0.1) & (outside < 0.9)).sum() > 30
 
 

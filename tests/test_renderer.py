@@ -142,15 +142,10 @@ def test_cameras_by_id_name_and_object(scene):
     np.testing.assert_allclose(pose[:3, 3], (0, -5, 2.5), atol=1e-6)
 
 
-def test_stages_are_timed(scene):
-    renderer, data = scene
-    moved = mujoco.MjData(renderer.model)
-    moved.qpos[0] += 0.01
-    mujoco.mj_forward(renderer.model, moved)
-    renderer.update_scene(moved, "front")
+def test_stages_are_timed():
+    renderer, _ = make_renderer(SCENE, 12, 16)
     renderer.render()
     stages = renderer.stage_seconds
-    renderer.update_scene(data, "front")
     assert list(stages) == [
         "primary visibility",
         "turn fields",

@@ -1,4 +1,4 @@
-"""Soft shadows for MuJoCo simulations, frame after frame, by precomputed shadow fields on Warp kernels."""
+"""Soft shadows and interreflection for MuJoCo simulations, frame after frame, on Warp kernels."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
