@@ -201,7 +201,7 @@ def test_an_empty_scene_has_no_indirect_light():
 @cache
 def mug() -> str:
     """A mesh with a cavity and a handle, a metre high."""
-    vertices, faces = bodies.mug(radius=0.45, height=1.0, rings=24, segments=30)
+    vertices, faces = bodies.mug(radius=0.45, height=1.0, rings=16, segments=20)
     numbers = [" ".join(map(str, np.asarray(array).ravel())) for array in (vertices.round(6), faces)]
     return f'<asset><mesh name="mug" vertex="{numbers[0]}" face="{numbers[1]}"/></asset>'
 

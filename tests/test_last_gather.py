@@ -59,6 +59,7 @@ def test_sparse_probes_show_what_a_probe_at_every_pixel_does(monkeypatch, materi
     renderer, _ = start(scene, header=SHARP)
     found = renderer.layers()
     body = found["segmentation"][..., 0] >= 0
+    assert renderer._last_gather is not None
     assert renderer._last_gather.count < 0.25 * body.sum()
     np.testing.assert_array_equal(found["segmentation"], expected["segmentation"])
     # Cells are halved until probes agree within 10 % of the indirect light or 2 % of all light, so that pixels between

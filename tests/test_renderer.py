@@ -289,6 +289,39 @@ def test_vertex_shading_is_like_pixel_shading():
         assert np.quantile(error, 0.98) <= limit
 
 
+def test_bounced_light_is_a_layer_of_the_color(scene):
+    renderer, data = scene
+    renderer.update_scene(data, "front")
+    layers = renderer.layers()
+    body = layers["segmentation"][..., 0] >= 0
+    # Nothing here emits, and edges mix in some background: away from them the two layers are all.
+    inner = (renderer._surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH) & body
+    total = layers["direct"] + layers["indirect"]
+    assert layers["color"][inner] == pytest.approx(total[inner], rel=1e-5)
+    assert layers["indirect"][inner].max() > 0.01
+    assert not layers["indirect"][~body & (renderer._surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH)].any()
+
+
+@pytest.mark.parametrize("shading", ["pixel", "vertex"])
+def test_bounces_change_no_direct_light(shading):
+    pictures = []
+    for bounces in (0, 2):
+        renderer, data = make_renderer(SCENE, 27, 48, bounces=bounces, shading=shading)
+        renderer.update_scene(data, "front")
+        pictures.append(renderer.layers())
+    np.testing.assert_array_equal(pictures[0]["direct"], pictures[1]["direct"])
+    assert not pictures[0]["indirect"].any()
+    assert pictures[1]["indirect"].max() > 0.01
+
+
+def test_vertex_shading_has_the_same_bounced_light():
+    # Direct light is interpolated from vertices; bounced light is gathered at pixels either way.
+    layers = {shading: turned(np.eye(3), shading=shading) for shading in ("pixel", "vertex")}
+    difference = np.abs(layers["pixel"]["indirect"] - layers["vertex"]["indirect"])
+    assert layers["pixel"]["indirect"].max() > 0.05
+    assert np.quantile(difference, 0.98) < 0.01 * layers["pixel"]["indirect"].max()
+
+
 def test_area_lights_hang_on_bodies():
     lamp = psf.rectangle_light("lamp", 0.5, 0.5, (5, 5, 5), (0, 0, -0.5), (0, 0, -1), body="box")
     renderer, data = make_renderer(SCENE, HEIGHT, WIDTH, environment=None, lights=[lamp])

@@ -10,7 +10,7 @@ from warp_psf.device import launch
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.shade.patches import Patches, PatchTable, axis_vector, slab_from_world, slab_origin
 
-# The least half-extent over which a body passes through a plane, in units of its bounding radius: a flat one is on one
+# The least half-extent over which a body passes through a plane, in units of its half-diagonal: a flat one is on one
 # side or the other.
 THINNEST = 1.0e-3
 
@@ -26,25 +26,21 @@ class RelationTable:
 
 @wp.struct
 class Extent:
-    """Where something lies in the world: within `radius` and the box of three half axes around `center`."""
+    """Where something lies in the world: in the box of three half axes around a centre."""
 
     center: wp.vec3
-    radius: wp.float32
     axes: wp.mat33  # in columns
 
 
 @wp.func
-def extent_of(world: int, entity: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable) -> Extent:
-    """A slab's box, any other body's bounding sphere."""
+def extent_of(world: int, entity: int, geometry: GeometryTable, poses: PoseTable) -> Extent:
+    """An entity's bounding box: its sphere would reach below the floor on which it stands."""
+    lower = geometry.lower[entity]
+    upper = geometry.upper[entity]
+    rotation = poses.rotation[world, entity]
     extent = Extent()
-    extent.center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
-    if patches.first_face[entity] >= 0:
-        half = patches.slab_half[entity]
-        to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
-        extent.center = slab_origin(world, entity, poses, patches)
-        extent.axes = to_world * wp.diag(half)
-    else:
-        extent.radius = geometry.radius[entity]
+    extent.center = poses.position[world, entity] + rotation * (0.5 * (lower + upper))
+    extent.axes = rotation * wp.diag(0.5 * (upper - lower))
     return extent
 
 
@@ -68,15 +64,13 @@ def extent_of_face(world: int, face: int, poses: PoseTable, patches: PatchTable)
 def reach_of(extent: Extent, n: wp.vec3) -> float:
     """How far an extent reaches from its centre along a direction, metres."""
     along = wp.transpose(extent.axes) * n
-    return extent.radius + wp.abs(along[0]) + wp.abs(along[1]) + wp.abs(along[2])
+    return wp.abs(along[0]) + wp.abs(along[1]) + wp.abs(along[2])
 
 
 @wp.func
 def part_behind(extent: Extent, n: wp.vec3, height: float) -> float:
     """The part of an extent behind a plane with normal n over which its centre stands at `height`, metres."""
-    size = extent.radius + wp.sqrt(
-        wp.length_sq(extent.axes[0]) + wp.length_sq(extent.axes[1]) + wp.length_sq(extent.axes[2])
-    )
+    size = wp.sqrt(wp.length_sq(extent.axes[0]) + wp.length_sq(extent.axes[1]) + wp.length_sq(extent.axes[2]))
     return wp.clamp(0.5 - 0.5 * height / wp.max(reach_of(extent, n), wp.static(THINNEST) * size), 0.0, 1.0)
 
 
@@ -96,7 +90,7 @@ def _relate(first: int, geometry: GeometryTable, poses: PoseTable, patches: Patc
     if source < faces:
         extent = extent_of_face(world, source, poses, patches)
     else:
-        extent = extent_of(world, source - faces, geometry, poses, patches)
+        extent = extent_of(world, source - faces, geometry, poses)
     for face in range(faces):
         n = normal_of(world, face, poses, patches)
         middle = extent_of_face(world, face, poses, patches).center
