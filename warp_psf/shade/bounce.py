@@ -26,9 +26,9 @@ from warp_psf.shade.direct import DirectState, make_direct
 from warp_psf.shade.faces import make_faces
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.patches import (
-    BLOCK,
     Patches,
     PatchTable,
+    block_of,
     build_pyramids,
     place_texels,
     slab_from_world,
@@ -86,6 +86,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         fields: RadianceTable,
         bodies: BodyTable,
         threshold: float,
+        first_texel: int,
         kept: KeptTable,
     ):
         world, station = wp.tid()
@@ -107,11 +108,13 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         sine = sources.sine
         ahead = sources.ahead
         bodies_from = patches.entity.shape[0]
+        open_to = values(1.0)
         covers = between.lists()
         gain = between.numbers()
         for place in range(sources.count):
             covered = kit.covered_by(world, entity_at[place], p, geometry, poses, o)
             covers[place] = weight[place] * covered
+            open_to = wp.cw_mul(open_to, values(1.0) - covers[place])
             gain[place] = between.horizon_gain(covered, surface.normal, lighting.weights[0], o.quadrature)
         count = int(0)
         faces = int(0)
@@ -152,6 +155,12 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                         kept.face[world, station, faces] = face
                         kept.transport[world, station, faces] = wp.cw_mul(passed, weighted)
                         faces += 1
+        if proxy >= first_texel:
+            openness = kit.sum_of_products(open_to, transfer) / wp.pi
+            block = block_of(proxy - first_texel, patches)
+            for y in range(block[3]):
+                for x in range(block[2]):
+                    patches.openness[world, block[0] + y * block[1] + x] = openness
         kept.count[world, station] = count
         kept.face_count[world, station] = faces
 
@@ -224,16 +233,10 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             radiance_out[world, proxy] = radiance
             total_out[world, proxy] = total_out[world, proxy] + radiance
             return
-        face = patches.texel_face[proxy - first_texel]
-        size = patches.size[face]
-        start = first_texel + patches.first_texel[face]
-        across = wp.min(wp.static(BLOCK), size[0])
-        down = wp.min(wp.static(BLOCK), size[1])
-        left = (proxy - start) % size[0] / across * across
-        top = (proxy - start) / size[0] / down * down
-        for y in range(top, top + down):
-            for x in range(left, left + across):
-                texel = start + y * size[0] + x
+        block = block_of(proxy - first_texel, patches)
+        for y in range(block[3]):
+            for x in range(block[2]):
+                texel = first_texel + block[0] + y * block[1] + x
                 radiance_out[world, texel] = radiance
                 total_out[world, texel] = total_out[world, texel] + radiance
 
@@ -366,7 +369,7 @@ def gather_basis_irradiances(
     place_texels(state.patches, scene, state.proxies, state.first_texel, device)
     relate(state.relations, state.patches, scene, device)
     tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.relations]
-    inputs = [state.proxies, *tables, state.fields, state.bodies, threshold]
+    inputs = [state.proxies, *tables, state.fields, state.bodies, threshold, state.first_texel]
     launch(kit.gather_basis, state.kept.count.shape, inputs, [state.kept], device)
 
 

@@ -27,6 +27,9 @@ BLOCK = 4
 FEWEST_TEXELS_PER_SIDE = 2
 # Bodies that rise above a face by less than this share of the slab's half-diagonal do not see it.
 FACE_HORIZON = 1.0e-4
+# A texel counts as seen when this share of its hemisphere is open, less so below, and never for nothing.
+SEEN_OPENNESS = 0.25
+LEAST_SEEN = 0.01
 # A slab encloses the end of a face when it reaches to within this share of the other's half-diagonal of it.
 ENCLOSED = 1.0e-4
 # Without bodies that draw texels to themselves they are spread evenly, as if drawn from this many half sides around.
@@ -56,7 +59,9 @@ class PatchTable:
     # (world, face): along u and along v, where texels are finest, from the middle of the part, and how fine
     focus: wp.array2d(dtype=wp.vec4)
     seen: wp.array2d(dtype=wp.int32)  # (world, face): 1 when another body rises above it
-    radiance: wp.array2d(dtype=wp.vec4)  # (world, place in a pyramid): three channels and a filler
+    radiance: wp.array2d(dtype=wp.vec4)  # (world, place in a pyramid): three channels, and how far it is seen
+    # (world, texel): share of its hemisphere that no body takes up, as the sight of the texel is weighted
+    openness: wp.array2d(dtype=wp.float32)
 
 
 @dataclass(frozen=True)
@@ -164,6 +169,19 @@ def uncovered_part(world: int, face: int, geometry: GeometryTable, poses: PoseTa
     )
 
 
+@wp.func
+def block_of(texel: int, patches: PatchTable) -> wp.vec4i:
+    """The block in which a texel lies: its first texel, the texels from one row to the next, and its own two sides."""
+    face = patches.texel_face[texel]
+    size = patches.size[face]
+    start = patches.first_texel[face]
+    across = wp.min(wp.static(BLOCK), size[0])
+    down = wp.min(wp.static(BLOCK), size[1])
+    left = (texel - start) % size[0] / across * across
+    top = (texel - start) / size[0] / down * down
+    return wp.vec4i(start + top * size[0] + left, size[0], across, down)
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable):
     world, face = wp.tid()
@@ -235,6 +253,14 @@ def _place_texels(first: int, poses: PoseTable, patches: PatchTable, first_proxy
     proxies.normal[world, proxy] = to_world * n
 
 
+@wp.func
+def average_seen(a: wp.vec4, b: wp.vec4, c: wp.vec4, d: wp.vec4) -> wp.vec4:
+    """The mean of four texels, each counted as far as it is seen."""
+    seen = a[3] + b[3] + c[3] + d[3]
+    mean = (a[3] * a + b[3] * b + c[3] * c + d[3] * d) / wp.max(seen, 1.0e-9)
+    return wp.vec4(mean[0], mean[1], mean[2], 0.25 * seen)
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _build_pyramids(
     first: int,
@@ -242,38 +268,54 @@ def _build_pyramids(
     first_proxy: int,
     patches: PatchTable,
 ):
+    # What a body stands on is dark and hidden by that same body. Band-limited functions do not tell that sharply: they
+    # would see some of the dark below the body in place of the light beside it. So hidden texels take the light of
+    # their surroundings: up the pyramid as means of what is seen, down again into the places that are not.
     world, face = wp.tid()
     face += first
     if patches.seen[world, face] == 0:
         return
-    width = patches.size[face][0]
-    height = patches.size[face][1]
+    size = patches.size[face]
     start = patches.first[face]
-    for index in range(width * height):
-        color = radiance[world, first_proxy + patches.first_texel[face] + index]
-        patches.radiance[world, start + index] = wp.vec4(color[0], color[1], color[2], 0.0)
+    for index in range(size[0] * size[1]):
+        texel = patches.first_texel[face] + index
+        color = radiance[world, first_proxy + texel]
+        seen = wp.clamp(patches.openness[world, texel] / wp.static(SEEN_OPENNESS), wp.static(LEAST_SEEN), 1.0)
+        patches.radiance[world, start + index] = wp.vec4(color[0], color[1], color[2], seen)
     levels = patches.levels[face]
-    for _level in range(1, levels):
+    for level in range(1, levels):
+        below = wp.vec2i(wp.max(size[0] >> (level - 1), 1), wp.max(size[1] >> (level - 1), 1))
+        width = wp.max(size[0] >> level, 1)
+        height = wp.max(size[1] >> level, 1)
         # A side that has one texel left is no longer halved.
-        step_x = wp.where(width > 1, 1, 0)
-        step_y = wp.where(height > 1, 1, 0)
-        next_width = wp.max(width / 2, 1)
-        next_height = wp.max(height / 2, 1)
-        next_start = start + width * height
-        for index in range(next_width * next_height):
-            x = (index % next_width) * (1 + step_x)
-            y = (index / next_width) * (1 + step_y)
-            a = start + y * width + x
-            b = a + step_y * width
-            patches.radiance[world, next_start + index] = 0.25 * (
-                patches.radiance[world, a]
-                + patches.radiance[world, a + step_x]
-                + patches.radiance[world, b]
-                + patches.radiance[world, b + step_x]
+        step_x = below[0] / width - 1
+        step_y = below[1] / height - 1
+        above = start + below[0] * below[1]
+        for index in range(width * height):
+            a = start + (index / width) * (1 + step_y) * below[0] + (index % width) * (1 + step_x)
+            b = a + step_y * below[0]
+            patches.radiance[world, above + index] = average_seen(
+                patches.radiance[world, a],
+                patches.radiance[world, a + step_x],
+                patches.radiance[world, b],
+                patches.radiance[world, b + step_x],
             )
-        start = next_start
-        width = next_width
-        height = next_height
+        start = above
+    for turn in range(1, levels):
+        level = levels - 1 - turn
+        width = wp.max(size[0] >> level, 1)
+        height = wp.max(size[1] >> level, 1)
+        above = start
+        above_width = wp.max(size[0] >> (level + 1), 1)
+        above_height = wp.max(size[1] >> (level + 1), 1)
+        start = above - width * height
+        for index in range(width * height):
+            own = patches.radiance[world, start + index]
+            x = (index % width) * above_width / width
+            y = (index / width) * above_height / height
+            around = patches.radiance[world, above + y * above_width + x]
+            mixed = own[3] * own + (1.0 - own[3]) * around
+            patches.radiance[world, start + index] = wp.vec4(mixed[0], mixed[1], mixed[2], own[3])
 
 
 def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState, worlds: int, device: wp.Device):
@@ -317,6 +359,7 @@ def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState
     table.part = wp.zeros((worlds, len(faces)), dtype=wp.vec4, device=device)
     table.focus = wp.zeros((worlds, len(faces)), dtype=wp.vec4, device=device)
     table.seen = wp.zeros((worlds, len(faces)), dtype=wp.int32, device=device)
+    table.openness = wp.full((worlds, int(texels.sum())), 1.0, dtype=wp.float32, device=device)
     table.radiance = wp.zeros((worlds, sum(places)), dtype=wp.vec4, device=device)
     stations = [start + _block_centers(size) for start, size in zip(np.cumsum(texels) - texels, sizes, strict=True)]
     return Patches(table, int(texels.sum()), np.concatenate([np.zeros(0, np.int64), *stations]))
