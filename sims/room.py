@@ -95,7 +95,12 @@ def lights() -> tuple:
     height = HIGH[2] - LIGHT_GAP
     return (
         psf.rectangle_light(
-            "panel", LIGHT_SIDE, LIGHT_SIDE, radiance=(18.0, 16.8, 15.0), position=(0, -0.3, height), target=(0, -0.3, 0)
+            "panel",
+            LIGHT_SIDE,
+            LIGHT_SIDE,
+            radiance=(18.0, 16.8, 15.0),
+            position=(0, -0.3, height),
+            target=(0, -0.3, 0),
         ),
     )
 

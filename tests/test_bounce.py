@@ -227,11 +227,6 @@ def test_a_concave_body_lights_itself():
     assert np.sqrt(np.mean((found - expected) ** 2)) < 0.05 * expected.max()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="functions found from lights around a body leave most of what only its cavity sends out unrepresented: "
-    "the second bounce within a mug has 0.36 of its energy, the third 0.11",
-)
 @pytest.mark.usefixtures("coarse_shadows")
 def test_a_concave_body_lights_itself_again():
     renderer, data = start(INTO_MUG, header=mug(), environment=SLANTED, bounces=3)
@@ -268,11 +263,6 @@ def test_a_body_out_of_reach_sends_nothing():
         assert np.abs(near["indirect"] - alone["indirect"])[body].mean() > np.abs(apart[1])[body].mean()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a body draws the texels of floors and walls towards itself from any distance: 1 km away it moves their "
-    "focus to the edge, and a wall that meets the floor gets 7 % more light, a third of the brightest in single pixels",
-)
 def test_a_body_out_of_reach_changes_nothing():
     _, away, alone = leaving()
     assert np.abs(away["indirect"] - alone["indirect"]).max() < 0.01 * alone["indirect"].max()

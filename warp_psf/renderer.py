@@ -410,7 +410,7 @@ def _same_poses(a: Poses, b: Poses | None) -> bool:
 
 
 def _check_bounces(bounces: int, threshold: float, functions: int) -> None:
-    if int(bounces) != bounces or not 0 <= bounces <= MOST_BOUNCES:
+    if not 0 <= bounces <= MOST_BOUNCES or int(bounces) != bounces:
         raise ValueError(f"bounces is {bounces}; give a whole number from 0 to {MOST_BOUNCES}")
     if not 0.0 < threshold < 1.0:
         raise ValueError(f"bounce_threshold is {threshold}; give a share between 0 and 1")

@@ -32,6 +32,8 @@ SEEN_OPENNESS = 0.25
 LEAST_SEEN = 0.01
 # A slab encloses the end of a face when it reaches to within this share of the other's half-diagonal of it.
 ENCLOSED = 1.0e-4
+# How far around a single body texels are fine, in its bounding radii: its shadow and what it lights lie within.
+SPREAD_PER_RADIUS = 3.0
 # Without bodies that draw texels to themselves they are spread evenly, as if drawn from this many half sides around.
 EVEN_SPREAD = 8.0
 
@@ -208,13 +210,18 @@ def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches:
             if wp.dot(n, p) + rise > half[2] + wp.static(FACE_HORIZON) * geometry.radius[own]:
                 seen = 1
             if patches.first_face[entity] < 0:
-                # Bodies with a shape of their own draw the texels to where they are.
-                x = wp.clamp(p[(axis + 1) % 3] - part[0], -part[1], part[1])
-                y = wp.clamp(p[(axis + 2) % 3] - part[2], -part[3], part[3])
-                spread = geometry.radius[entity] * geometry.radius[entity]
-                count += 1.0
-                mean += wp.vec2(x, y)
-                squares += wp.vec2(x * x + spread, y * y + spread)
+                # Bodies with a shape of their own draw the texels to where they are, those far away hardly.
+                u = p[(axis + 1) % 3] - part[0]
+                v = p[(axis + 2) % 3] - part[2]
+                x = wp.clamp(u, -part[1], part[1])
+                y = wp.clamp(v, -part[3], part[3])
+                squared = geometry.radius[entity] * geometry.radius[entity]
+                away = wp.length_sq(wp.vec3(u - x, v - y, wp.max(wp.dot(n, p) - half[2], 0.0)))
+                pull = squared / (squared + away)
+                spread = wp.static(SPREAD_PER_RADIUS * SPREAD_PER_RADIUS) * squared
+                count += pull
+                mean += pull * wp.vec2(x, y)
+                squares += pull * wp.vec2(x * x + spread, y * y + spread)
     # The sides of a rectangle have no area, nor has what is enclosed.
     patches.seen[world, face] = wp.where(part[1] * part[3] > 0.0, seen, 0)
     focus = wp.vec4(0.0, wp.static(EVEN_SPREAD) * part[1], 0.0, wp.static(EVEN_SPREAD) * part[3])
