@@ -1,4 +1,4 @@
-"""Brute-force reference of light that bounces between Lambert surfaces: paths traced through everything.
+"""Brute-force reference of light that bounces between surfaces: paths traced through everything.
 
 What comes after one, two, three reflections is kept apart, so that a bounce can be checked by itself.
 """
@@ -32,7 +32,7 @@ class WorldMeshes:
     """Surfaces in the world, all of them one mesh.
 
     vertices, normals: metres and unit vectors, float32 [V, 3]. faces: int32 [F, 3]; entity: of each face, int32 [F].
-    albedo, emission: of each entity, float64 [E, 3].
+    albedo, specular, emission: of each entity, float64 [E, 3]. exponent: of each Phong lobe, float64 [E].
     """
 
     vertices: np.ndarray
@@ -41,6 +41,8 @@ class WorldMeshes:
     entity: np.ndarray
     albedo: np.ndarray
     emission: np.ndarray
+    specular: np.ndarray
+    exponent: np.ndarray
 
 
 def world_meshes(
@@ -67,7 +69,8 @@ def world_meshes(
             entity.append(np.full(len(mesh.faces), number, np.int32))
             total += len(mesh.vertices)
         materials = [scene.entities[index].material for index in indices]
-        colors = (np.array([material.albedo for material in materials]), np.array([m.emission for m in materials]))
+        colors = [np.array([getattr(m, name) for m in materials]) for name in ("albedo", "emission", "specular")]
+        colors.append(np.array([m.exponent for m in materials]))
         return WorldMeshes(*map(np.concatenate, (vertices, normals, faces, entity)), *colors)
 
     surfaces = merge(range(first_light))
@@ -84,6 +87,8 @@ class SurfaceTable:
     entity: wp.array(dtype=wp.int32)  # (face)
     albedo: wp.array(dtype=wp.vec3)  # (entity)
     emission: wp.array(dtype=wp.vec3)  # (entity)
+    specular: wp.array(dtype=wp.vec3)  # (entity), zero where Phong lobes are left out
+    exponent: wp.array(dtype=wp.float32)  # (entity)
 
 
 @wp.struct
@@ -143,8 +148,17 @@ def cosine_direction(normal: wp.vec3, sample: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def sample_lights(mesh: wp.uint64, lights: LightTable, origin: wp.vec3, normal: wp.vec3, sample: wp.vec2) -> wp.vec3:
-    """One sample of the irradiance that the area lights cause."""
+def reflectance(albedo: wp.vec3, specular: wp.vec3, exponent: float, mirrored: wp.vec3, incoming: wp.vec3) -> wp.vec3:
+    """pi times the reflectance per solid angle; mirrored: where a mirror would send what is seen."""
+    aligned = wp.dot(mirrored, incoming)
+    if aligned <= 0.0:
+        return albedo
+    return albedo + (0.5 * (exponent + 2.0) * wp.pow(aligned, exponent)) * specular
+
+
+@wp.func
+def sample_lights(mesh: wp.uint64, lights: LightTable, origin: wp.vec3, normal: wp.vec3, sample: wp.vec2):
+    """One sample of the irradiance that the area lights cause, and the direction that it comes from."""
     low = int(0)
     high = int(lights.corner.shape[0])
     while high - low > 1:
@@ -167,7 +181,7 @@ def sample_lights(mesh: wp.uint64, lights: LightTable, origin: wp.vec3, normal: 
     if cosine > 0.0 and cosine_light > 0.0:
         if not wp.mesh_query_ray_anyhit(mesh, origin, toward, distance * wp.static(SHADOW_SHARE)):
             received = cosine * cosine_light / (distance * distance) * lights.power[low]
-    return received
+    return received, toward
 
 
 @cache
@@ -197,14 +211,22 @@ def make_tracer(order: int) -> SimpleNamespace:
             origin = points[receiver] + RAY_OFFSET * normal
             # What a reflection towards the receiver leaves of the light.
             throughput = wp.vec3(share, share, share)
+            # The receiver itself only collects light.
+            albedo = wp.vec3(1.0, 1.0, 1.0)
+            specular = wp.vec3()
+            exponent = float(1.0)
+            mirrored = wp.vec3()
             bounce = int(0)
             while bounce <= bounces:
                 key = seed + wp.uint32(receiver) * wp.uint32(wp.static(KEYS)) + wp.uint32(2 * bounce)
                 if lights.corner.shape[0] > 0:
                     sample = sobol_pair(wp.uint32(path), key + wp.uint32(1))
-                    received = sample_lights(surfaces.mesh, lights, origin, normal, sample)
-                    irradiance_out[bounce, receiver] += wp.cw_mul(throughput, received)
+                    received, toward = sample_lights(surfaces.mesh, lights, origin, normal, sample)
+                    reflected = reflectance(albedo, specular, exponent, mirrored, toward)
+                    irradiance_out[bounce, receiver] += wp.cw_mul(wp.cw_mul(throughput, reflected), received)
                 direction = cosine_direction(normal, sobol_pair(wp.uint32(path), key))
+                reflected = reflectance(albedo, specular, exponent, mirrored, direction)
+                throughput = wp.cw_mul(throughput, reflected)
                 hit = wp.mesh_query_ray(surfaces.mesh, origin, direction, FAR)
                 if hit.result:
                     face = surfaces.faces[hit.face]
@@ -213,7 +235,9 @@ def make_tracer(order: int) -> SimpleNamespace:
                     if bounce < bounces and hit.sign > 0.0:
                         emitted = wp.pi * surfaces.emission[entity]
                         irradiance_out[bounce + 1, receiver] += wp.cw_mul(throughput, emitted)
-                    throughput = wp.cw_mul(throughput, surfaces.albedo[entity])
+                    albedo = surfaces.albedo[entity]
+                    specular = surfaces.specular[entity]
+                    exponent = surfaces.exponent[entity]
                     origin = origin + hit.t * direction + (RAY_OFFSET * side) * hit.normal
                     smooth = (
                         hit.u * surfaces.normals[face[0]]
@@ -221,6 +245,7 @@ def make_tracer(order: int) -> SimpleNamespace:
                         + (1.0 - hit.u - hit.v) * surfaces.normals[face[2]]
                     )
                     normal = side * wp.normalize(smooth)
+                    mirrored = direction - 2.0 * wp.dot(direction, normal) * normal
                     bounce += 1
                 else:
                     values = kit.evaluate(direction)
@@ -245,13 +270,15 @@ def traced_bounces(
     paths: int = DEFAULT_PATHS,
     seed: int = 0,
     material_space: str = "srgb",
+    phong: bool = False,
 ) -> np.ndarray:
     """Irradiance at points [N, 3] with normals [N, 3] after 0, 1, ... reflections, float32 [bounces + 1, N, 3].
 
     Entry 0 is direct light of the environment and the area lights, entry b what arrives after exactly b reflections.
     What surfaces emit (from their front, `Material.emission`) has left a surface once: it counts from entry 1 on.
 
-    Every surface is Lambert with its `Material.albedo`; Phong lobes are left out. Both sides of a face reflect. The
+    Every surface is Lambert with its `Material.albedo`, and with `phong` has its lobe about the mirror direction too,
+    (n + 2)/(2 pi) cos^n times `Material.specular`. Both sides of a face reflect. The
     cosine is that of the interpolated vertex normal, turned to the side that the ray comes from, as the renderer
     shades; rays leave along the face's own normal, by `RAY_OFFSET`. (So a ray may start into the surface; it then ends
     at its back.) Area lights shine from their front, reflect nothing and cast no shadow.
@@ -265,6 +292,7 @@ def traced_bounces(
         lights: area lights, posed as in `data`.
         paths: per point; powers of two are spread best.
         seed: two seeds give independent errors.
+        phong: with the surfaces' Phong lobes.
     """
     device = find_device()
     surfaces, shining = world_meshes(model, data, lights, material_space)
@@ -276,7 +304,7 @@ def traced_bounces(
     tracer = make_tracer(sh.order_of(len(coefficients)))
     out = wp.zeros((bounces + 1, len(points)), dtype=wp.vec3, device=device)
     inputs = [
-        _upload_surfaces(surfaces, mesh, device),
+        _upload_surfaces(surfaces, mesh, phong, device),
         _upload_lights(shining, device),
         wp.array(coefficients.T.astype(np.float32), dtype=tracer.vec, device=device),
         wp.array(points, dtype=wp.vec3, device=device),
@@ -290,7 +318,7 @@ def traced_bounces(
     return out.numpy()
 
 
-def _upload_surfaces(surfaces: WorldMeshes, mesh: wp.Mesh, device: wp.Device) -> SurfaceTable:
+def _upload_surfaces(surfaces: WorldMeshes, mesh: wp.Mesh, phong: bool, device: wp.Device) -> SurfaceTable:
     table = SurfaceTable()
     table.mesh = mesh.id
     table.normals = wp.array(surfaces.normals, dtype=wp.vec3, device=device)
@@ -298,6 +326,8 @@ def _upload_surfaces(surfaces: WorldMeshes, mesh: wp.Mesh, device: wp.Device) ->
     table.entity = wp.array(surfaces.entity, dtype=wp.int32, device=device)
     table.albedo = wp.array(surfaces.albedo, dtype=wp.vec3, device=device)
     table.emission = wp.array(surfaces.emission, dtype=wp.vec3, device=device)
+    table.specular = wp.array(surfaces.specular if phong else 0 * surfaces.specular, dtype=wp.vec3, device=device)
+    table.exponent = wp.array(surfaces.exponent, dtype=wp.float32, device=device)
     return table
 
 

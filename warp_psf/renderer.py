@@ -27,6 +27,7 @@ from warp_psf.scene.scene import Poses
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
 from warp_psf.shade.delta import add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import shade_direct, upload_lighting, write_environment
+from warp_psf.shade.gloss import shade_gloss
 from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.lattice import STRIDES, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occlude import turn_occlusion, upload_occlusion
@@ -354,6 +355,8 @@ class Renderer:
             self._has_moved = False
         with self._timed("light on proxies"):
             shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, *bounces.received, device)
+            seen = (bounces.proxies, scene, *lights, self._delta_lights)
+            shade_gloss(bounces.gloss, *seen, bounces.received[0], device)
             casts, eye = self._occlusion.table.occluders.casts, self._lighting.table.eye
             add_delta_lights(bounces.proxies, scene, casts, eye, self._delta_lights, *bounces.received, device)
         with self._timed("bounces"):

@@ -18,12 +18,12 @@ from typing import Any
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.field.radiance import SummedFields, make_radiance
+from warp_psf.field.radiance import SummedFields
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import make_between, overlap
-from warp_psf.shade.direct import DirectState, make_direct
-from warp_psf.shade.faces import make_faces
+from warp_psf.shade.direct import DirectState
+from warp_psf.shade.gloss import GlossState, make_gloss
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.patches import (
     Patches,
@@ -40,38 +40,12 @@ from warp_psf.shade.relations import RelationTable, hidden_part, hides_face, rel
 @cache
 def make_bounce(order: int, functions: int) -> SimpleNamespace:
     """The kernels and tables of the bounces on `order` bands with `functions` basis functions per body."""
-    kit = make_direct(order)
+    kit = make_gloss(order, functions)
     between = make_between(order)
-    patch = make_faces(order)
-    radiant = make_radiance(order, functions)
-    values = kit.values
+    patch, radiant, values = kit.patch, kit.radiant, kit.values
     per_function = radiant.weights
     Occlusion, Lighting, RadianceTable = kit.Occlusion, kit.Lighting, radiant.RadianceTable
-
-    @wp.struct
-    class BodyTable:
-        """The bodies that send out light through basis functions."""
-
-        field: wp.array(dtype=wp.int32)  # (entity): its basis radiance field, -1 for slabs and lights
-        first_proxy: wp.array(dtype=wp.int32)  # (entity)
-        proxies: wp.array(dtype=wp.int32)  # (entity): how many
-        first_solver: wp.array(dtype=wp.int32)  # (entity): its first number in `solver`
-        solver: wp.array(dtype=wp.float32)  # per body (function, proxy), Iwasaki 2007, section 5.2
-        own: wp.array(dtype=per_function)  # (body proxy): irradiance there that the body's own functions cause
-        weights: wp.array3d(dtype=per_function)  # (world, entity, channel)
-
-    @wp.struct
-    class KeptTable:
-        """What the proxies receive per unit of light, kept for as long as nothing moves."""
-
-        proxy: wp.array(dtype=wp.int32)  # (station): the proxies at which bounced light is gathered
-        count: wp.array2d(dtype=wp.int32)  # (world, station)
-        entity: wp.array3d(dtype=wp.int32)  # (world, station, place)
-        irradiance: wp.array3d(dtype=per_function)  # (world, station, place): basis irradiances
-        face_count: wp.array2d(dtype=wp.int32)  # (world, station)
-        face: wp.array3d(dtype=wp.int32)  # (world, station, place)
-        # (world, station, place): what the radiance of the face at the directions is to be multiplied with
-        transport: wp.array3d(dtype=values)
+    BodyTable, KeptTable, GlossTable = kit.BodyTable, kit.KeptTable, kit.GlossTable
 
     @wp.kernel(enable_backward=False, module="unique")
     def gather_basis(
@@ -85,6 +59,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         relations: RelationTable,
         fields: RadianceTable,
         bodies: BodyTable,
+        gloss: GlossTable,
         threshold: float,
         first_texel: int,
         kept: KeptTable,
@@ -136,9 +111,13 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
                 where = radiant.locate(fields, bodies.field[source], p_body)
-                received = kit.project(gain[place] * wp.cw_mul(passed, weighted), o.rows[world, source])
+                light = gain[place] * wp.cw_mul(passed, weighted)
+                rows = o.rows[world, source]
                 kept.entity[world, station, count] = source
-                kept.irradiance[world, station, count] = radiant.basis_irradiance(fields, where, received)
+                kept.irradiance[world, station, count] = radiant.basis_irradiance(
+                    fields, where, kit.project(light, rows)
+                )
+                kit.keep_moments(world, station, count, proxy, source, light, rows, o.quadrature, fields, where, gloss)
                 count += 1
             elif patches.first_face[source] >= 0:
                 to_slab = slab_from_world(world, source, poses, patches)
@@ -170,6 +149,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         proxies: ReceiverTable,
         geometry: GeometryTable,
         irradiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+        gloss: GlossTable,
         radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         total_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
     ):
@@ -180,6 +160,16 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         if entity >= 0:
             reflectance = geometry.albedo[entity] + geometry.specular[entity]
             radiance = geometry.emission[entity] + wp.cw_mul(reflectance, irradiance[world, proxy]) / wp.pi
+            if gloss.place[proxy] >= 0:
+                radiance = geometry.emission[entity] + kit.leave_glossy(
+                    world,
+                    gloss.place[proxy],
+                    entity,
+                    proxies.normal[world, proxy],
+                    irradiance[world, proxy],
+                    geometry,
+                    gloss,
+                )
         radiance_out[world, proxy] = radiance
         total_out[world, proxy] = radiance
 
@@ -193,6 +183,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         patches: PatchTable,
         bodies: BodyTable,
         kept: KeptTable,
+        gloss: GlossTable,
         first_texel: int,
         radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         total_out: wp.array2d(dtype=wp.vec3),  # (world, proxy), added to
@@ -204,6 +195,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         if own < 0:
             return
         irradiance = wp.vec3()
+        if gloss.extra.shape[1] > 0:
+            irradiance = gloss.extra[world, station]
         normal = proxies.normal[world, proxy]
         for place in range(kept.count[world, station]):
             received = kept.irradiance[world, station, place]
@@ -228,7 +221,10 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                 wp.dot(from_itself, bodies.weights[world, own, 2]),
             )
         reflectance = geometry.albedo[own] + geometry.specular[own]
-        radiance = wp.cw_mul(reflectance, wp.max(irradiance, wp.vec3())) / wp.pi
+        irradiance = wp.max(irradiance, wp.vec3())
+        radiance = wp.cw_mul(reflectance, irradiance) / wp.pi
+        if gloss.place[proxy] >= 0:
+            radiance = kit.leave_glossy(world, gloss.place[proxy], own, normal, irradiance, geometry, gloss)
         if proxy < first_texel:
             radiance_out[world, proxy] = radiance
             total_out[world, proxy] = total_out[world, proxy] + radiance
@@ -285,11 +281,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         **vars(kit),
-        radiant=radiant,
         between=between,
-        patch=patch,
-        BodyTable=BodyTable,
-        KeptTable=KeptTable,
         gather_basis=gather_basis,
         leave_surface=leave_surface,
         bounce_light=bounce_light,
@@ -328,6 +320,7 @@ class BounceState:
     body_normals: wp.array
     bodies: Any  # make_bounce(order, functions).BodyTable
     kept: Any  # make_bounce(order, functions).KeptTable
+    gloss: GlossState
     fields: Any  # make_radiance(order, functions).RadianceTable
     patches: Patches
     relations: RelationTable
@@ -339,7 +332,7 @@ class BounceState:
     own_rows: wp.array  # (own vertex): row of own_functions, which entities of one mesh share
     own_functions: wp.array
     own_light: wp.array  # vec3 (world, own vertex): irradiance there from the body itself
-    turns: wp.array  # all 1: every proxy is shaded
+    turns: wp.array  # int32 (world, proxy): 1, but 0 for proxies of glossy bodies, which `shade_moments` shades
     received: tuple[wp.array, wp.array]  # irradiance and Phong radiance of direct light
     radiance: wp.array  # vec3 (world, proxy): the light that leaves after the last bounce
     total: wp.array  # vec3 (world, proxy): and after all bounces so far
@@ -369,7 +362,7 @@ def gather_basis_irradiances(
     place_texels(state.patches, scene, state.proxies, state.first_texel, device)
     relate(state.relations, state.patches, scene, device)
     tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.relations]
-    inputs = [state.proxies, *tables, state.fields, state.bodies, threshold, state.first_texel]
+    inputs = [state.proxies, *tables, state.fields, state.bodies, state.gloss.table, threshold, state.first_texel]
     launch(kit.gather_basis, state.kept.count.shape, inputs, [state.kept], device)
 
 
@@ -380,21 +373,30 @@ def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, ti
     """
     kit = make_bounce(state.order, state.functions)
     shape, patches = state.turns.shape, state.patches
-    outputs = [state.radiance, state.total]
-    launch(kit.leave_surface, shape, [state.proxies, scene.geometry, state.received[0]], outputs, device)
+    outputs, gloss = [state.radiance, state.total], state.gloss
+    gloss.table.total.zero_()
+    inputs = [state.proxies, scene.geometry, state.received[0], gloss.table]
+    launch(kit.leave_surface, shape, inputs, outputs, device)
     for _ in range(times - 1):
-        _represent(state, state.radiance, device)
+        _represent(state, state.radiance, gloss.table.vector, device)
         inputs = [state.proxies, scene.geometry, scene.poses, occlusion.table, patches.table, state.bodies, state.kept]
-        launch(kit.bounce_light, state.kept.count.shape, [*inputs, state.first_texel], outputs, device)
-    _represent(state, state.total, device)
+        launch(kit.add_gloss, gloss.table.extra.shape, [state.bodies, state.kept, gloss.table], [], device)
+        launch(kit.gather_moments, gloss.table.vector.shape, [*inputs, gloss.table], [], device)
+        inputs += [gloss.table, state.first_texel]
+        launch(kit.bounce_light, state.kept.count.shape, inputs, outputs, device)
+    _represent(state, state.total, gloss.table.total, device)
     inputs = [state.bodies, state.own_entities, state.own_rows, state.own_functions]
     launch(kit.light_itself, state.own_light.shape, inputs, [state.own_light], device)
 
 
-def _represent(state: BounceState, radiance: wp.array, device: wp.Device) -> None:
-    """Turns the proxies' light into weights and texels."""
+def _represent(state: BounceState, radiance: wp.array, vector: wp.array, device: wp.Device) -> None:
+    """Turns the proxies' light into weights and texels. vector: mat33 (world, glossy proxy), see `GlossTable`."""
     kit = make_bounce(state.order, state.functions)
     worlds, entities = state.weights.shape[:2]
     dim = (worlds, entities * state.functions)
     launch(kit.solve_weights, dim, [state.bodies, radiance], [state.weights, state.weights_rgb], device)
+    inputs = [state.bodies, state.proxies, state.gloss.table, vector]
+    dim = (worlds, state.gloss.table.entity.shape[0] * state.functions)
+    outputs = [state.gloss.weights, state.gloss.along, state.weights_rgb]
+    launch(kit.solve_gloss, dim, inputs, outputs, device)
     build_pyramids(state.patches, radiance, state.first_texel, device)

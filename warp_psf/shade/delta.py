@@ -82,6 +82,67 @@ def bulb_point(ray: int, count: int) -> wp.vec2:
     return wp.vec2(radius * wp.cos(6.2831853 * turned), radius * wp.sin(6.2831853 * turned))
 
 
+@wp.func
+def delta_light(
+    world: int,
+    light: int,
+    entity: int,
+    p: wp.vec3,
+    n: wp.vec3,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    casts: wp.array(dtype=wp.bool),  # (entity)
+    lights: DeltaLightTable,
+    far: float,
+):
+    """The unit vector to a light, its strength at p, the share of it that is not blocked, and its cosine to n.
+
+    Of a light that sends nothing to p the share is 0.
+    """
+    origin = p
+    if lights.shadows_itself[entity]:
+        origin = p + (wp.static(SHADOW_OFFSET) * geometry.radius[entity]) * n
+    kind = lights.kind[world, light]
+    toward = -far * lights.direction[world, light]
+    strength = float(1.0)
+    if kind != wp.static(KINDS["directional"]):
+        toward = lights.position[world, light] - p
+        distance = wp.length(toward)
+        a = lights.attenuation[world, light]
+        strength = wp.where(distance < lights.reach[world, light], 1.0, 0.0)
+        strength /= wp.max(a[0] + a[1] * distance + a[2] * distance * distance, 1.0e-6)
+        if kind == wp.static(KINDS["spot"]):
+            along = -wp.dot(toward, lights.direction[world, light]) / wp.max(distance, 1.0e-9)
+            cone = lights.spot[world, light]
+            strength *= wp.where(along > cone[0], wp.pow(wp.max(along, 0.0), cone[1]), 0.0)
+    unit = wp.normalize(toward)
+    cosine = wp.dot(n, unit)
+    lit = float(0.0)
+    if cosine > 0.0 and strength > 0.0:
+        lit = 1.0
+        if lights.casts[world, light]:
+            radius = lights.radius[world, light]
+            if radius > 0.0 and kind != wp.static(KINDS["directional"]):
+                # A disc that faces the receiver stands for the bulb.
+                disc = sphere.frame_of(unit)
+                open_rays = int(0)
+                cast = int(0)
+                rays = int(wp.static(BULB_RAYS))
+                for ray in range(rays):
+                    # Steps of 29 through 48 visit every place once, and any twelve in a row are spread out.
+                    place = bulb_point((ray * 29) % wp.static(BULB_RAYS), wp.static(BULB_RAYS))
+                    decided = ray >= wp.static(FIRST_BULB_RAYS) and (open_rays == 0 or open_rays == cast)
+                    if not decided:
+                        aimed = toward + radius * (disc * wp.vec3(place[0], place[1], 0.0))
+                        cast += 1
+                        if not is_blocked(world, entity, origin, aimed, geometry, poses, casts, lights.shadows_itself):
+                            open_rays += 1
+                lit = float(open_rays) / float(cast)
+            elif is_blocked(world, entity, origin, toward, geometry, poses, casts, lights.shadows_itself):
+                lit = 0.0
+    return unit, strength, lit, cosine
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _add_delta_lights(
     first: int,
@@ -102,9 +163,6 @@ def _add_delta_lights(
         return
     n = receivers.normal[world, receiver]
     p = receivers.position[world, receiver]
-    origin = p
-    if lights.shadows_itself[entity]:
-        origin = p + (wp.static(SHADOW_OFFSET) * geometry.radius[entity]) * n
     exponent = geometry.exponent[entity]
     view = wp.normalize(eye[world] - p)
     mirrored = 2.0 * wp.dot(n, view) * n - view
@@ -112,45 +170,8 @@ def _add_delta_lights(
     glossy = wp.vec3()
     for light in range(lights.kind.shape[1]):
         diffuse += wp.static(math.pi) * lights.ambient[world, light]
-        kind = lights.kind[world, light]
-        toward = -far * lights.direction[world, light]
-        strength = float(1.0)
-        if kind != wp.static(KINDS["directional"]):
-            toward = lights.position[world, light] - p
-            distance = wp.length(toward)
-            a = lights.attenuation[world, light]
-            strength = wp.where(distance < lights.reach[world, light], 1.0, 0.0)
-            strength /= wp.max(a[0] + a[1] * distance + a[2] * distance * distance, 1.0e-6)
-            if kind == wp.static(KINDS["spot"]):
-                along = -wp.dot(toward, lights.direction[world, light]) / wp.max(distance, 1.0e-9)
-                cone = lights.spot[world, light]
-                strength *= wp.where(along > cone[0], wp.pow(wp.max(along, 0.0), cone[1]), 0.0)
-        unit = wp.normalize(toward)
-        cosine = wp.dot(n, unit)
-        if cosine > 0.0 and strength > 0.0:
-            lit = float(1.0)
-            if lights.casts[world, light]:
-                radius = lights.radius[world, light]
-                if radius > 0.0 and kind != wp.static(KINDS["directional"]):
-                    # A disc that faces the receiver stands for the bulb.
-                    disc = sphere.frame_of(unit)
-                    open_rays = int(0)
-                    cast = int(0)
-                    rays = int(wp.static(BULB_RAYS))
-                    for ray in range(rays):
-                        # Steps of 29 through 48 visit every place once, and any twelve in a row are spread out.
-                        place = bulb_point((ray * 29) % wp.static(BULB_RAYS), wp.static(BULB_RAYS))
-                        decided = ray >= wp.static(FIRST_BULB_RAYS) and (open_rays == 0 or open_rays == cast)
-                        if not decided:
-                            aimed = toward + radius * (disc * wp.vec3(place[0], place[1], 0.0))
-                            cast += 1
-                            if not is_blocked(
-                                world, entity, origin, aimed, geometry, poses, casts, lights.shadows_itself
-                            ):
-                                open_rays += 1
-                    lit = float(open_rays) / float(cast)
-                elif is_blocked(world, entity, origin, toward, geometry, poses, casts, lights.shadows_itself):
-                    lit = 0.0
+        unit, strength, lit, cosine = delta_light(world, light, entity, p, n, geometry, poses, casts, lights, far)
+        if lit > 0.0:
             diffuse += (wp.static(math.pi) * strength * lit * cosine) * lights.diffuse[world, light]
             aligned = wp.dot(mirrored, unit)
             # Behind the mirror direction there is nothing, though 0^0 is 1.

@@ -109,6 +109,15 @@ def make_direct(order: int) -> SimpleNamespace:
         return kit.zonal_at_directions(wp.static(cosine_profile), surface.normal, o.quadrature)
 
     @wp.func
+    def open_to_self(surface: Surface, rows: wp.array(dtype=half_values), lighting: Lighting, o: Occlusion) -> values:
+        """1 minus what the body itself blocks above the horizon."""
+        open_share = values(1.0)
+        if surface.first_transfer >= 0 and lighting.light_entity.shape[0] > 0:
+            open_share += interpolate(lighting.self_visibility, surface, rows)
+            open_share -= kit.cap_coverage(surface.normal, 1.0, o.quadrature)
+        return open_share
+
+    @wp.func
     def environment_light(world: int, received: values, lighting: Lighting) -> wp.vec3:
         return wp.vec3(
             kit.sum_of_products(lighting.environment[world, 0], received),
@@ -209,17 +218,13 @@ def make_direct(order: int) -> SimpleNamespace:
             lobe = wp.cw_mul(lobe, transfer)
             glossy = environment_light(world, wp.cw_mul(visible, lobe), lighting)
 
-        open_to_self = values(1.0)
-        if surface.first_transfer >= 0 and lights > 0:
-            # 1 minus what the body itself blocks above the horizon.
-            open_to_self += interpolate(lighting.self_visibility, surface, rows)
-            open_to_self -= kit.cap_coverage(n, 1.0, o.quadrature)
+        open_share = open_to_self(surface, rows, lighting, o)
         for light in range(lights):
             if light > 0:
                 shining = lighting.light_entity[light]
                 facing = facing_of(world, light, poses, lighting)
                 _visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
-            passed = wp.cw_mul(before, open_to_self)
+            passed = wp.cw_mul(before, open_share)
             irradiance, gloss = area_light(world, light, surface, passed, lobe, geometry, poses, o, lighting)
             diffuse += irradiance * lighting.light_radiance[world, light]
             glossy += gloss * lighting.light_radiance[world, light]
@@ -235,6 +240,10 @@ def make_direct(order: int) -> SimpleNamespace:
         Surface=Surface,
         surface_of=surface_of,
         transfer_of=transfer_of,
+        open_to_self=open_to_self,
+        environment_light=environment_light,
+        facing_of=facing_of,
+        area_light=area_light,
         shade_receivers=shade_receivers,
     )
 

@@ -141,6 +141,49 @@ def project_snippet(coefficients: int, points: int) -> str:
     """
 
 
+def along_axis_snippet(points: int) -> str:
+    """C++ that multiplies values with a coordinate of the direction."""
+    half = points // 2
+    return f"""
+    wp::vec_t<{points}, float> result;
+    for (int i = 0; i < {half}; ++i) {{
+        const float along = quadrature.data[axis][i];
+        result[i] = along * v[i];
+        result[{half} + i] = -along * v[{half} + i];
+    }}
+    return result;
+    """
+
+
+def project_products_snippet(coefficients: int, points: int, products: tuple[tuple[int, ...], ...]) -> str:
+    """C++ that projects values times products of coordinates (0: x, 1: y, 2: z), a row of coefficients for each."""
+    half = points // 2
+    sums = {parity: sum_in_lanes(half, f"{parity}[i + lane] * rows.data[k][i + lane]") for parity in ("even", "odd")}
+    is_odd = ", ".join("true" if math.isqrt(k) % 2 else "false" for k in range(coefficients))
+    parts = []
+    for row, axes in enumerate(products):
+        product = " * ".join(f"quadrature.data[{axis}][i]" for axis in axes)
+        # An odd product makes odd of even.
+        signs = "+-" if len(axes) % 2 == 0 else "-+"
+        parts.append(f"""
+    for (int i = 0; i < {half}; ++i) {{
+        const float product = {product};
+        even[i] = product * (weighted[i] {signs[0]} weighted[{half} + i]);
+        odd[i] = product * (weighted[i] {signs[1]} weighted[{half} + i]);
+    }}
+    for (int k = 0; k < {coefficients}; ++k) {{
+        if (is_odd[k]) {{ {sums["odd"]} result.data[{row}][k] = sums[0]; }}
+        else {{ {sums["even"]} result.data[{row}][k] = sums[0]; }}
+    }}""")
+    return f"""
+    const bool is_odd[{coefficients}] = {{{is_odd}}};
+    float even[{half}], odd[{half}];
+    wp::mat_t<{len(products)}, {coefficients}, float> result;
+    {"".join(parts)}
+    return result;
+    """
+
+
 def _at_directions_snippet(order: int, points: int) -> str:
     half = points // 2
     terms = {0: [], 1: []}

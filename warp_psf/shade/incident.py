@@ -87,6 +87,9 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         bodies: kit.BodyTable,
         summed: wp.array2d(dtype=radiant.rgb),  # (world, entity's sample)
         summed_first: wp.array(dtype=wp.int32),  # (entity)
+        gloss: kit.GlossTable,
+        along: wp.array2d(dtype=radiant.rgb),  # (world, sample of a glossy body's axis)
+        along_first: wp.array(dtype=wp.int32),  # (3 row + axis)
         wide_rows: wp.array(dtype=half_values),
         threshold: float,
         light_out: wp.array2d(dtype=wide),  # (probe, channel)
@@ -143,6 +146,18 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
                     kit.at_directions(channel_of(rgb, 2), rows),
                 )
                 incident = add_products(incident, radiance, passed)
+                row = gloss.row[source]
+                if row >= 0:
+                    for axis in range(3):
+                        rgb = radiant.lookup_summed(along[world], along_first[3 * row + axis], where)
+                        radiance = join(
+                            kit.at_directions(channel_of(rgb, 0), rows),
+                            kit.at_directions(channel_of(rgb, 1), rows),
+                            kit.at_directions(channel_of(rgb, 2), rows),
+                        )
+                        # Light leaves against the direction in which it is seen.
+                        passed_along = kit.along_axis(passed, axis, o.quadrature)
+                        incident = add_products(incident, radiance, -passed_along)
             elif patches.first_face[source] >= 0:
                 to_slab = slab_from_world(world, source, poses, patches)
                 p_slab = to_slab * (p - slab_origin(world, source, poses, patches))

@@ -212,6 +212,7 @@ def gather_last_bounce(
     state, table, kit = gather.bounces, gather.table, make_last_bounce(gather.bounces.order, gather.bounces.functions)
     worlds = extra.shape[0]
     sum_fields(state.summed, state.fields, state.weights_rgb, device)
+    sum_fields(state.gloss.summed, state.fields, state.gloss.along, device)
     for array, value in ((table.probe, -1), (table.refined, 0), (gather.pixel_of, -1), (gather.chosen, 0)):
         array.fill_(value)
     gather.count = 0
@@ -268,6 +269,9 @@ def _gather_chosen(
         state.bodies,
         state.summed.summed,
         state.summed.first,
+        state.gloss.table,
+        state.gloss.summed.summed,
+        state.gloss.summed.first,
     ]
     launch(kit.gather_incident, (1, fresh), [*inputs, gather.wide_rows, gather.threshold], [gather.light], device)
     gather.count += fresh

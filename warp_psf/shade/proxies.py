@@ -12,9 +12,11 @@ from warp_psf.scene.receiver import make_receivers
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.between import MOST_SOURCES
 from warp_psf.shade.bounce import BounceState, make_bounce
+from warp_psf.shade.gloss import GlossState
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.patches import Patches, upload_patches
 from warp_psf.shade.relations import make_relations
+from warp_psf.shade.separable import factor_lobe
 
 # Proxies of one body, and of all bodies together: where there are many bodies, each gets fewer.
 MOST_PROXIES_PER_BODY = 192
@@ -89,6 +91,11 @@ def upload_bounces(
 
     patches = upload_patches(scene, is_patch, occlusion, worlds, device)
     slots = total + patches.texels
+    kept = _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device)
+    glossy = [entity for entity in chosen if scene.entities[entity].material.specular.max() > 0.0]
+    gloss = _make_gloss(scene, glossy, kept, slots, starts, counts, field_of, fields, (order, functions), device)
+    turns = np.ones(slots, np.int32)
+    turns[gloss.table.proxy.numpy()] = 0
     proxies = make_receivers((worlds, slots), device)
     proxies.entity.fill_(-1)
     face = np.concatenate([np.zeros(0, np.int32), *faces, np.zeros(patches.texels, np.int32)])
@@ -104,7 +111,8 @@ def upload_bounces(
         upload(stack(points, 3), wp.vec3),
         upload(stack(normals, 3), wp.vec3),
         bodies,
-        _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device),
+        kept,
+        gloss,
         upload_radiance(fields, order, functions, device),
         patches,
         make_relations(patches, len(radiating), worlds, device),
@@ -112,7 +120,7 @@ def upload_bounces(
         wp.zeros((worlds, len(radiating), functions), dtype=wp.vec3, device=device),
         make_summed([int(field) for field in field_of], fields, order, functions, worlds, device),
         *_upload_own(radiating, functions, worlds, device),
-        wp.full((worlds, slots), 1, dtype=wp.int32, device=device),
+        upload(np.repeat(turns[None], worlds, axis=0), wp.int32),
         tuple(wp.zeros((worlds, slots), dtype=wp.vec3, device=device) for _ in range(2)),
         wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
         wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
@@ -163,6 +171,51 @@ def _make_kept(
     kept.face = wp.zeros((*shape, faces), dtype=wp.int32, device=device)
     kept.transport = wp.zeros((*shape, faces), dtype=kit.values, device=device)
     return kept
+
+
+def _make_gloss(
+    scene: Scene,
+    glossy: list[int],
+    kept,
+    slots: int,
+    starts: np.ndarray,
+    counts: np.ndarray,
+    field_of: np.ndarray,
+    fields: list[BasisRadianceField],
+    size: tuple[int, int],
+    device: wp.Device,
+) -> GlossState:
+    """glossy: entities. starts, counts, field_of: of each entity's proxies and field. size: order and functions."""
+    kit = make_bounce(*size)
+    functions = size[1]
+    worlds, stations, places = kept.entity.shape
+    row = np.full(len(scene.entities), -1)
+    row[glossy] = np.arange(len(glossy))
+    proxy = np.concatenate([np.zeros(0, np.int64), *(starts[entity] + np.arange(counts[entity]) for entity in glossy)])
+    place = np.full(slots, -1)
+    place[proxy] = np.arange(len(proxy))
+
+    def upload(values) -> wp.array:
+        return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=device)
+
+    def room(dtype: type, *shape: int) -> wp.array:
+        return wp.zeros((worlds, *shape), dtype=dtype, device=device)
+
+    table = kit.GlossTable()
+    table.row, table.entity, table.proxy, table.place = upload(row), upload(glossy), upload(proxy), upload(place)
+    table.first_place = upload(place[starts[glossy]])
+    factors = [factor_lobe(scene.entities[entity].material.exponent) for entity in glossy]
+    table.factors = wp.array(np.array(factors, np.float32).reshape(-1, 4), dtype=wp.vec4, device=device)
+    lit = stations if glossy else 0
+    table.first, table.extra = room(kit.moments.first, lit, places), room(wp.vec3, lit)
+    table.second = room(kit.moments.second, len(proxy), places)
+    table.moment, table.vector, table.total = (room(wp.mat33, len(proxy)) for _ in range(3))
+    shape = (worlds, 4 * len(glossy), 3)
+    weights = wp.zeros((*shape, functions), dtype=wp.float32, device=device)
+    table.weights = wp.array(ptr=weights.ptr, dtype=kit.radiant.weights, shape=shape, device=device, copy=False)
+    along = room(wp.vec3, 3 * len(glossy), functions)
+    summed = make_summed([int(field_of[entity]) for entity in glossy for _ in range(3)], fields, *size, worlds, device)
+    return GlossState(*size, table, weights, along, summed)
 
 
 def _faces_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
