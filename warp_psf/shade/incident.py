@@ -5,6 +5,7 @@ brings a body's light; the radiance of slabs comes from their texels. What stand
 proxies. The result is not yet multiplied with what a surface makes of it: neighbours with other normals share it.
 """
 
+import math
 from functools import cache
 from types import SimpleNamespace
 
@@ -45,17 +46,17 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
     @wp.func_native(_widen_snippet(order, bands))
     def widen(v: vec) -> wide: ...
 
-    @wp.func_native(_channel_snippet(order))
-    def channel_of(rgb: radiant.rgb, channel: int) -> vec: ...
-
     @wp.func_native(_add_products_snippet(kit.points))
     def add_products(sum: kit.rgb_values, rgb: kit.rgb_values, passed: values) -> kit.rgb_values: ...
 
     @wp.func_native(_weigh_channel_snippet(kit.points))
     def weigh_channel(rgb: kit.rgb_values, channel: int, weights: values) -> values: ...
 
-    @wp.func_native(_join_snippet(kit.points))
-    def join(red: values, green: values, blue: values) -> kit.rgb_values: ...
+    @wp.func_native(_add_vectors_snippet(order, kit.points))
+    def add_vectors(
+        sum: kit.rgb_values, rgb: radiant.rgb, rows: wp.array(dtype=half_values), passed: values
+    ) -> kit.rgb_values:
+        """Adds the SH vectors of three channels, at the directions, times what is passed on in each."""
 
     @wp.func
     def to_sh(
@@ -140,24 +141,14 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
                 where = radiant.locate(fields, bodies.field[source], p_body)
                 rgb = radiant.lookup_summed(summed[world], summed_first[source], where)
                 rows = o.rows[world, source]
-                radiance = join(
-                    kit.at_directions(channel_of(rgb, 0), rows),
-                    kit.at_directions(channel_of(rgb, 1), rows),
-                    kit.at_directions(channel_of(rgb, 2), rows),
-                )
-                incident = add_products(incident, radiance, passed)
+                incident = add_vectors(incident, rgb, rows, passed)
                 row = gloss.row[source]
                 if row >= 0:
                     for axis in range(3):
                         rgb = radiant.lookup_summed(along[world], along_first[3 * row + axis], where)
-                        radiance = join(
-                            kit.at_directions(channel_of(rgb, 0), rows),
-                            kit.at_directions(channel_of(rgb, 1), rows),
-                            kit.at_directions(channel_of(rgb, 2), rows),
-                        )
                         # Light leaves against the direction in which it is seen.
                         passed_along = kit.along_axis(passed, axis, o.quadrature)
-                        incident = add_products(incident, radiance, -passed_along)
+                        incident = add_vectors(incident, rgb, rows, -passed_along)
             elif patches.first_face[source] >= 0:
                 to_slab = slab_from_world(world, source, poses, patches)
                 p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
@@ -220,14 +211,6 @@ def _widen_snippet(order: int, bands: int) -> str:
     """
 
 
-def _channel_snippet(order: int) -> str:
-    return f"""
-    wp::vec_t<{order * order}, float> one;
-    for (int k = 0; k < {order * order}; ++k) one[k] = rgb[channel * {order * order} + k];
-    return one;
-    """
-
-
 def _add_products_snippet(points: int) -> str:
     return f"""
     wp::vec_t<{3 * points}, float> result;
@@ -247,13 +230,19 @@ def _weigh_channel_snippet(points: int) -> str:
     """
 
 
-def _join_snippet(points: int) -> str:
+def _add_vectors_snippet(order: int, points: int) -> str:
+    half, count = points // 2, order * order
+    terms: dict[int, list[str]] = {0: [], 1: []}
+    for k in range(count):
+        terms[math.isqrt(k) % 2].append(f"rgb[channel * {count} + {k}] * rows.data[{k}][i]")
     return f"""
-    wp::vec_t<{3 * points}, float> all;
-    for (int i = 0; i < {points}; ++i) {{
-        all[i] = red[i];
-        all[{points} + i] = green[i];
-        all[{2 * points} + i] = blue[i];
-    }}
-    return all;
+    wp::vec_t<{3 * points}, float> result = sum;
+    for (int channel = 0; channel < 3; ++channel)
+        for (int i = 0; i < {half}; ++i) {{
+            const float even = {" + ".join(terms[0])};
+            const float odd = {" + ".join(terms[1]) or "0.0f"};
+            result[channel * {points} + i] += (even + odd) * passed[i];
+            result[channel * {points} + {half} + i] += (even - odd) * passed[{half} + i];
+        }}
+    return result;
     """

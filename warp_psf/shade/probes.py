@@ -17,7 +17,7 @@ from warp_psf.shade.lattice import INTERPOLATED
 SPACINGS = (8, 4, 2)
 # Probes are close enough when what a pixel between them receives differs by no more than this share of the brightest,
 # or by no more than this share of all light there.
-SMOOTH_INDIRECT = 0.1
+SMOOTH_INDIRECT = 0.15
 SMOOTH_ALL = 0.02
 # A pixel takes over a probe on the same body whose normal is near its own (cosines: full at the first, not at all at
 # the second), and which lies near its tangent plane (sines likewise): not one from the other side of a handle.

@@ -18,8 +18,11 @@ from warp_psf.shade.patches import Patches, upload_patches
 from warp_psf.shade.relations import make_relations
 from warp_psf.shade.separable import factor_lobe
 
+# A lobe that reflects no more than this is sent on evenly, as if it were Lambert: MuJoCo's default material's reflects
+# 0.055 of the light, too little for its shape to be seen on other bodies, and the terms double the cost of a bounce.
+LEAST_LOBE = 0.1
 # Proxies of one body, and of all bodies together: where there are many bodies, each gets fewer.
-MOST_PROXIES_PER_BODY = 192
+MOST_PROXIES_PER_BODY = 96
 FEWEST_PROXIES_PER_BODY = 48
 MOST_PROXIES = 6144
 # Faces of slabs that a proxy keeps values of: three sides of a box can be seen at once.
@@ -92,7 +95,7 @@ def upload_bounces(
     patches = upload_patches(scene, is_patch, occlusion, worlds, device)
     slots = total + patches.texels
     kept = _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device)
-    glossy = [entity for entity in chosen if scene.entities[entity].material.specular.max() > 0.0]
+    glossy = [entity for entity in chosen if scene.entities[entity].material.specular.max() > LEAST_LOBE]
     gloss = _make_gloss(scene, glossy, kept, slots, starts, counts, field_of, fields, (order, functions), device)
     turns = np.ones(slots, np.int32)
     turns[gloss.table.proxy.numpy()] = 0
