@@ -23,6 +23,8 @@ from warp_psf.shade.lattice import INTERPOLATED, Lattice, interpolate_lattice
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.probes import LEAST_WEIGHT, SPACINGS, ProbeTable, make_probes
 
+# A lobe that reflects no more than this mirrors the bodies around too faintly to be seen; it takes their mean.
+LEAST_SHINE = 0.03
 # Room for probes at first, as a share of the pixels; it grows when a picture needs more.
 FIRST_ROOM = 1 / 8
 
@@ -63,7 +65,7 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             return
         surface = kit.surface_of(world, slot, receivers, geometry, poses, lighting)
         response = kit.response_of(world, surface, poses, lighting)
-        is_glossy = wp.max(geometry.specular[entity]) > 0.0
+        is_glossy = wp.max(geometry.specular[entity]) > wp.static(LEAST_SHINE)
         shine = wide()
         if is_glossy:
             transfer = kit.transfer_of(surface, o.rows[world, entity], lighting, o)
@@ -101,6 +103,8 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             diffuse += from_itself
             # Of what a body sends to itself only the sum is known, not where it comes from.
             glossy += from_itself / wp.pi
+        if not is_glossy:
+            glossy = diffuse / wp.pi
         diffuse_out[world, slot] = wp.max(diffuse, wp.vec3())
         glossy_out[world, slot] = wp.max(glossy, wp.vec3())
 
@@ -220,11 +224,11 @@ def gather_last_bounce(
     seen = [pixels, scene.geometry, scene.poses, lighting.table]
     cells = [-(-table.width // spacing) * -(-table.height // spacing) for spacing in SPACINGS]
     launch(_choose_lattice, (worlds, cells[0]), [SPACINGS[0], table, pixels], [gather.chosen], device)
-    _gather_chosen(gather, pixels, scene, occlusion, lighting, device)
+    _gather_chosen(gather, extra.shape[1], pixels, scene, occlusion, lighting, device)
     for turn in range(len(SPACINGS) - 1):
         inputs = [turn, table, *seen, gather.light, direct]
         launch(kit.refine_cells, (worlds, cells[turn]), inputs, [gather.chosen], device)
-        _gather_chosen(gather, pixels, scene, occlusion, lighting, device)
+        _gather_chosen(gather, extra.shape[1], pixels, scene, occlusion, lighting, device)
     launch(
         kit.choose_unserved,
         gather.chosen.shape,
@@ -232,7 +236,7 @@ def gather_last_bounce(
         [gather.chosen],
         device,
     )
-    _gather_chosen(gather, pixels, scene, occlusion, lighting, device)
+    _gather_chosen(gather, gather.chosen.shape[1], pixels, scene, occlusion, lighting, device)
 
     inputs = [table, pixels, gather.pixel_of, scene.geometry, scene.poses, occlusion.table, lighting.table]
     inputs += [gather.wide_rows, gather.light, state.own_first, state.own_light, lattice.turns]
@@ -242,13 +246,14 @@ def gather_last_bounce(
 
 def _gather_chosen(
     gather: LastGather,
+    slots: int,
     pixels: ReceiverTable,
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
     device: wp.Device,
 ) -> None:
-    """Makes probes of the chosen slots and gathers their light."""
+    """Makes probes of those of the first `slots` slots that are chosen, and gathers their light."""
     state = gather.bounces
     kit = make_last_bounce(state.order, state.functions)
     chosen, rank = gather.chosen.flatten(), gather.rank.flatten()
@@ -256,7 +261,8 @@ def _gather_chosen(
     fresh = int(rank[-1:].numpy()[0] + chosen[-1:].numpy()[0])
     if fresh == 0:
         return
-    launch(_number_probes, gather.chosen.shape, [gather.chosen, gather.rank, gather.count, gather.table], [], device)
+    dim = (gather.chosen.shape[0], slots)
+    launch(_number_probes, dim, [gather.chosen, gather.rank, gather.count, gather.table], [], device)
     if gather.count + fresh > gather.light.shape[0]:
         larger = wp.zeros((2 * (gather.count + fresh), 3), dtype=kit.wide, device=device)
         wp.copy(larger, gather.light, count=gather.light.size)

@@ -13,8 +13,8 @@ from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.incident import make_incident
 from warp_psf.shade.lattice import INTERPOLATED
 
-# Spacings of the probes, pixels. A cell of the first two is halved where its probes are not close enough.
-SPACINGS = (8, 4, 2)
+# Spacings of the probes, pixels. A cell of all but the last is halved where its probes are not close enough.
+SPACINGS = (16, 8, 4, 2)
 # Probes are close enough when what a pixel between them receives differs by no more than this share of the brightest,
 # or by no more than this share of all light there.
 SMOOTH_INDIRECT = 0.15
@@ -174,7 +174,9 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
                 if receivers.entity[world, pixel] >= 0:
                     surface = kit.surface_of(world, pixel, receivers, geometry, poses, lighting)
                     response = response_of(world, surface, poses, lighting)
-                    least = wp.where(turn == 0, wp.static(HALF_SERVED), wp.static(LEAST_WEIGHT))
+                    least = wp.where(
+                        turn < wp.static(len(SPACINGS) - 2), wp.static(HALF_SERVED), wp.static(LEAST_WEIGHT)
+                    )
                     smooth = has_smooth_cell(
                         world, pixel, spacing, response, least, direct[world, pixel], probes, receivers, light
                     )
