@@ -1,5 +1,6 @@
 """Glossy bodies as senders of bounced light: the lobe's separable terms, and pictures against the path tracer."""
 
+from collections.abc import Iterator
 from functools import cache
 
 import mujoco
@@ -9,10 +10,19 @@ import pytest
 import warp_psf as psf
 from tests.oracles_bounce import traced_bounces
 from tests.oracles_separable import cut_series, fitted, four_terms, hemisphere, phong_matrix, relative_error
-from tests.test_bounce import BALL, HEIGHT, WIDTH, camera, geom, shown, start
+from tests.test_bounce import BALL, HEIGHT, WIDTH, camera, gather_everywhere, geom, shown, start
 from warp_psf.basis import sh
 from warp_psf.shade import proxies
 from warp_psf.shade.separable import factor_lobe
+
+
+@pytest.fixture(scope="module", autouse=True)
+def at_every_pixel() -> Iterator[None]:
+    """What is tested is what bodies send: no pixel takes it from its neighbours."""
+    with pytest.MonkeyPatch.context() as patch:
+        gather_everywhere(patch)
+        yield
+
 
 # The lobe
 

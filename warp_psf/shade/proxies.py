@@ -22,7 +22,7 @@ from warp_psf.shade.separable import factor_lobe
 # 0.055 of the light, too little for its shape to be seen on other bodies, and the terms double the cost of a bounce.
 LEAST_LOBE = 0.1
 # Proxies of one body, and of all bodies together: where there are many bodies, each gets fewer.
-MOST_PROXIES_PER_BODY = 64
+MOST_PROXIES_PER_BODY = 96
 FEWEST_PROXIES_PER_BODY = 48
 MOST_PROXIES = 6144
 # Faces of slabs that a proxy keeps values of: three sides of a box can be seen at once.
