@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from numbers import Real
 from typing import NoReturn
 
 import mujoco
@@ -413,10 +414,10 @@ def _same_poses(a: Poses, b: Poses | None) -> bool:
 
 
 def _check_bounces(bounces: int, threshold: float, functions: int) -> None:
-    if not 0 <= bounces <= MOST_BOUNCES or int(bounces) != bounces:
-        raise ValueError(f"bounces is {bounces}; give a whole number from 0 to {MOST_BOUNCES}")
-    if not 0.0 < threshold < 1.0:
-        raise ValueError(f"bounce_threshold is {threshold}; give a share between 0 and 1")
+    if bounces not in range(MOST_BOUNCES + 1):
+        raise ValueError(f"bounces is {bounces!r}; give a whole number from 0 to {MOST_BOUNCES}")
+    if not isinstance(threshold, Real) or not 0.0 < threshold < 1.0:
+        raise ValueError(f"bounce_threshold is {threshold!r}; give a share between 0 and 1")
     if functions not in FUNCTION_COUNTS:
         raise ValueError(f"basis_functions is {functions}; choose one of {', '.join(map(str, FUNCTION_COUNTS))}")
 

@@ -182,7 +182,6 @@ def make_between(order: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(kit),
         lists=lists,
-        ids=ids,
         numbers=numbers,
         Sources=Sources,
         find_sources=find_sources,

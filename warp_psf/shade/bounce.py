@@ -34,7 +34,7 @@ from warp_psf.shade.patches import (
     slab_from_world,
     slab_origin,
 )
-from warp_psf.shade.relations import RelationTable, hidden_part, hides_face, relate
+from warp_psf.shade.relations import RelationTable, hides_body, hides_face, relate
 
 
 @cache
@@ -82,7 +82,6 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         radius = sources.radius
         sine = sources.sine
         ahead = sources.ahead
-        bodies_from = patches.entity.shape[0]
         open_to = values(1.0)
         covers = between.lists()
         gain = between.numbers()
@@ -101,12 +100,11 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                 for other in range(sources.count):
                     if other != place:
                         share = overlap(toward[other], sine[other], toward[place], sine[place])
-                        if share > 0.0 and ahead[other] > 0:
-                            first_face = patches.first_face[entity_at[other]]
-                            share *= hidden_part(world, bodies_from + source, first_face, ahead[other], relations)
-                        elif share > 0.0:
-                            further = distance[place] - distance[other]
-                            share *= wp.clamp(0.5 + further / (radius[place] + radius[other]), 0.0, 1.0)
+                        if share > 0.0:
+                            further = (distance[place] - distance[other]) / (radius[place] + radius[other])
+                            share *= hides_body(
+                                world, entity_at[other], ahead[other], source, further, patches, relations
+                            )
                         if share > 0.0:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
@@ -199,13 +197,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             irradiance = gloss.extra[world, station]
         normal = proxies.normal[world, proxy]
         for place in range(kept.count[world, station]):
-            received = kept.irradiance[world, station, place]
             source = kept.entity[world, station, place]
-            irradiance += wp.vec3(
-                wp.dot(received, bodies.weights[world, source, 0]),
-                wp.dot(received, bodies.weights[world, source, 1]),
-                wp.dot(received, bodies.weights[world, source, 2]),
-            )
+            irradiance += kit.light_of(world, source, kept.irradiance[world, station, place], bodies)
         for place in range(kept.face_count[world, station]):
             seen = kept.face[world, station, place]
             slab = patches.entity[seen]
@@ -214,12 +207,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             shown = patch.face_radiance(world, seen, p_slab, normal, to_slab, patches, o.quadrature)
             irradiance += kit.sum_rgb(kept.transport[world, station, place], shown)
         if bodies.field[own] >= 0:
-            from_itself = bodies.own[proxy]
-            irradiance += wp.vec3(
-                wp.dot(from_itself, bodies.weights[world, own, 0]),
-                wp.dot(from_itself, bodies.weights[world, own, 1]),
-                wp.dot(from_itself, bodies.weights[world, own, 2]),
-            )
+            irradiance += kit.light_of(world, own, bodies.own[proxy], bodies)
         reflectance = geometry.albedo[own] + geometry.specular[own]
         irradiance = wp.max(irradiance, wp.vec3())
         radiance = wp.cw_mul(reflectance, irradiance) / wp.pi
@@ -271,13 +259,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
     ):
         world, vertex = wp.tid()
         vertex += first
-        entity = entities[vertex]
-        from_itself = own_functions[rows[vertex]]
-        light_out[world, vertex] = wp.vec3(
-            wp.dot(from_itself, bodies.weights[world, entity, 0]),
-            wp.dot(from_itself, bodies.weights[world, entity, 1]),
-            wp.dot(from_itself, bodies.weights[world, entity, 2]),
-        )
+        light_out[world, vertex] = kit.light_of(world, entities[vertex], own_functions[rows[vertex]], bodies)
 
     return SimpleNamespace(
         **vars(kit),

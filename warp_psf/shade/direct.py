@@ -91,21 +91,20 @@ def make_direct(order: int) -> SimpleNamespace:
         return surface
 
     @wp.func
-    def interpolate(stored: wp.array(dtype=vec), surface: Surface, rows: wp.array(dtype=half_values)) -> values:
-        """A vector stored per vertex, at the surface and at the directions."""
+    def stored_at(stored: wp.array(dtype=vec), surface: Surface) -> vec:
+        """A vector stored per vertex, at the surface."""
         start = surface.first_transfer
-        return kit.at_directions(
+        return (
             surface.uv[0] * stored[start + surface.corners[0]]
             + surface.uv[1] * stored[start + surface.corners[1]]
-            + (1.0 - surface.uv[0] - surface.uv[1]) * stored[start + surface.corners[2]],
-            rows,
+            + (1.0 - surface.uv[0] - surface.uv[1]) * stored[start + surface.corners[2]]
         )
 
     @wp.func
     def transfer_of(surface: Surface, rows: wp.array(dtype=half_values), lighting: Lighting, o: Occlusion) -> values:
         """The clamped cosine, times what the body leaves of its own hemisphere."""
         if surface.first_transfer >= 0:
-            return interpolate(lighting.transfer, surface, rows)
+            return kit.at_directions(stored_at(lighting.transfer, surface), rows)
         return kit.zonal_at_directions(wp.static(cosine_profile), surface.normal, o.quadrature)
 
     @wp.func
@@ -113,7 +112,7 @@ def make_direct(order: int) -> SimpleNamespace:
         """1 minus what the body itself blocks above the horizon."""
         open_share = values(1.0)
         if surface.first_transfer >= 0 and lighting.light_entity.shape[0] > 0:
-            open_share += interpolate(lighting.self_visibility, surface, rows)
+            open_share += kit.at_directions(stored_at(lighting.self_visibility, surface), rows)
             open_share -= kit.cap_coverage(surface.normal, 1.0, o.quadrature)
         return open_share
 
@@ -239,6 +238,7 @@ def make_direct(order: int) -> SimpleNamespace:
         Lighting=Lighting,
         Surface=Surface,
         surface_of=surface_of,
+        stored_at=stored_at,
         transfer_of=transfer_of,
         open_to_self=open_to_self,
         environment_light=environment_light,

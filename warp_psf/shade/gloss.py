@@ -109,10 +109,6 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         gloss.total[world, place] = gloss.total[world, place] + vector
         return even
 
-    @wp.func
-    def moment_of(light: wp.vec3, direction: wp.vec3) -> wp.mat33:
-        return wp.outer(light, direction)
-
     @wp.kernel(enable_backward=False, module="unique")
     def shade_moments(
         first: int,
@@ -157,7 +153,7 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
             center = poses.position[world, source] + poses.rotation[world, source] * geometry.center[source]
             sent = strength * lighting.light_radiance[world, light]
             irradiance += sent
-            moment += moment_of(sent, wp.normalize(center - p))
+            moment += wp.outer(sent, wp.normalize(center - p))
         irradiance_out[world, proxy] = wp.max(irradiance, wp.vec3())
         gloss.moment[world, place] = moment
 
@@ -181,9 +177,9 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         moment = gloss.moment[world, place]
         for light in range(lights.kind.shape[1]):
             # Light that comes evenly from everywhere: the moment is two thirds of the irradiance.
-            moment += moment_of(2.0 / 3.0 * wp.pi * lights.ambient[world, light], n)
+            moment += wp.outer(2.0 / 3.0 * wp.pi * lights.ambient[world, light], n)
             unit, strength, lit, cosine = delta_light(world, light, entity, p, n, geometry, poses, casts, lights, far)
-            moment += moment_of((wp.pi * strength * lit * cosine) * lights.diffuse[world, light], unit)
+            moment += wp.outer((wp.pi * strength * lit * cosine) * lights.diffuse[world, light], unit)
         gloss.moment[world, place] = moment
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -252,12 +248,9 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
                 found = kit.sum_rgb(along_axis(transport, axis, o.quadrature), shown)
                 for channel in range(3):
                     moment[channel, axis] += found[channel]
-        from_itself = bodies.own[proxy]
-        light = wp.vec3()
-        for channel in range(3):
-            light[channel] = wp.dot(from_itself, bodies.weights[world, own, channel])
+        light = kit.light_of(world, own, bodies.own[proxy], bodies)
         # Of what a body sends to itself only the sum is known, not where it comes from.
-        gloss.moment[world, item] = moment + moment_of(2.0 / 3.0 * light, n)
+        gloss.moment[world, item] = moment + wp.outer(2.0 / 3.0 * light, n)
 
     @wp.kernel(enable_backward=False, module="unique")
     def solve_gloss(

@@ -19,7 +19,7 @@ from warp_psf.shade.between import overlap
 from warp_psf.shade.bounce import make_bounce
 from warp_psf.shade.directions import make_directions, project_snippet
 from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
-from warp_psf.shade.relations import RelationTable, hidden_part, hides_face
+from warp_psf.shade.relations import RelationTable, hides_body, hides_face
 
 
 def wide_order(order: int) -> int:
@@ -111,7 +111,6 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         radius = sources.radius
         sine = sources.sine
         ahead = sources.ahead
-        bodies_from = patches.entity.shape[0]
         covers = between.lists()
         # All pixels around a probe on a flat face have its normal; on round bodies they do not.
         gain = between.numbers()
@@ -129,12 +128,11 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
                 for other in range(sources.count):
                     if other != place:
                         share = overlap(toward[other], sine[other], toward[place], sine[place])
-                        if share > 0.0 and ahead[other] > 0:
-                            first_face = patches.first_face[entity_at[other]]
-                            share *= hidden_part(world, bodies_from + source, first_face, ahead[other], relations)
-                        elif share > 0.0:
-                            further = distance[place] - distance[other]
-                            share *= wp.clamp(0.5 + further / (radius[place] + radius[other]), 0.0, 1.0)
+                        if share > 0.0:
+                            further = (distance[place] - distance[other]) / (radius[place] + radius[other])
+                            share *= hides_body(
+                                world, entity_at[other], ahead[other], source, further, patches, relations
+                            )
                         if share > 0.0:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
                 p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
@@ -169,19 +167,10 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
             light_out[probe, channel] = to_sh(world, own, weighted, o, lighting, wide_rows)
 
     @wp.func
-    def stored_transfer(surface: Surface, lighting: Lighting) -> vec:
-        start = surface.first_transfer
-        return (
-            surface.uv[0] * lighting.transfer[start + surface.corners[0]]
-            + surface.uv[1] * lighting.transfer[start + surface.corners[1]]
-            + (1.0 - surface.uv[0] - surface.uv[1]) * lighting.transfer[start + surface.corners[2]]
-        )
-
-    @wp.func
     def response_of(world: int, surface: Surface, poses: PoseTable, lighting: Lighting) -> wide:
         """What incident light is to be multiplied with to give irradiance."""
         if surface.first_transfer >= 0:
-            return widen(stored_transfer(surface, lighting))
+            return widen(kit.stored_at(lighting.transfer, surface))
         n = surface.normal
         if lighting.first_transfer[surface.entity] >= 0:
             n = wp.transpose(poses.rotation[world, surface.entity]) * n

@@ -150,6 +150,21 @@ def is_smooth(
     )
 
 
+@wp.func
+def blend_corners(
+    light: wp.array2d(dtype=wp.vec3), world: int, corner: int, stride: int, width: int, x: int, y: int
+) -> wp.vec3:
+    """Light between the corners of the cell that begins at the pixel `corner`, x and y pixels into it."""
+    u = float(x) / float(stride)
+    v = float(y) / float(stride)
+    right = corner + stride
+    below = corner + stride * width
+    across = below + stride
+    return (1.0 - v) * ((1.0 - u) * light[world, corner] + u * light[world, right]) + v * (
+        (1.0 - u) * light[world, below] + u * light[world, across]
+    )
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _refine(
     first: int,
@@ -171,23 +186,14 @@ def _refine(
     smooth = x_0 + stride < width and y_0 + stride < height
     if smooth:
         smooth = is_smooth(receivers, diffuse, glossy, world, corner, width, height, stride)
-    right = corner + stride
-    below = corner + stride * width
-    across = below + stride
     half = stride / 2
     for y in range(wp.min(stride, height - y_0)):
         for x in range(wp.min(stride, width - x_0)):
             pixel = corner + y * width + x
             if turns[world, pixel] == 0:
                 if smooth:
-                    u = float(x) / float(stride)
-                    v = float(y) / float(stride)
-                    diffuse[world, pixel] = (1.0 - v) * (
-                        (1.0 - u) * diffuse[world, corner] + u * diffuse[world, right]
-                    ) + v * ((1.0 - u) * diffuse[world, below] + u * diffuse[world, across])
-                    glossy[world, pixel] = (1.0 - v) * (
-                        (1.0 - u) * glossy[world, corner] + u * glossy[world, right]
-                    ) + v * ((1.0 - u) * glossy[world, below] + u * glossy[world, across])
+                    diffuse[world, pixel] = blend_corners(diffuse, world, corner, stride, width, x, y)
+                    glossy[world, pixel] = blend_corners(glossy, world, corner, stride, width, x, y)
                     turns[world, pixel] = wp.static(INTERPOLATED)
                 elif x % half == 0 and y % half == 0:
                     turns[world, pixel] = turn + 1
@@ -224,18 +230,9 @@ def _interpolate(
                 is_wide = True
     if is_wide != (stride == wide):
         return
-    u = float(x % stride) / float(stride)
-    v = float(y % stride) / float(stride)
-    a = x - x % stride + (y - y % stride) * width
-    b = a + stride
-    c = a + stride * width
-    d = c + stride
-    diffuse[world, pixel] = (1.0 - v) * ((1.0 - u) * diffuse[world, a] + u * diffuse[world, b]) + v * (
-        (1.0 - u) * diffuse[world, c] + u * diffuse[world, d]
-    )
-    glossy[world, pixel] = (1.0 - v) * ((1.0 - u) * glossy[world, a] + u * glossy[world, b]) + v * (
-        (1.0 - u) * glossy[world, c] + u * glossy[world, d]
-    )
+    corner = x - x % stride + (y - y % stride) * width
+    diffuse[world, pixel] = blend_corners(diffuse, world, corner, stride, width, x % stride, y % stride)
+    glossy[world, pixel] = blend_corners(glossy, world, corner, stride, width, x % stride, y % stride)
 
 
 def make_lattice(worlds: int, slots: int, width: int, height: int, device: wp.Device) -> Lattice:

@@ -136,6 +136,26 @@ def hides_face(world: int, entity: int, ahead: int, face: int, patches: PatchTab
     return share
 
 
+@wp.func
+def hides_body(
+    world: int,
+    entity: int,
+    ahead: int,
+    body: int,
+    further: float,
+    patches: PatchTable,
+    relations: RelationTable,
+) -> float:
+    """How far an entity in the same direction lies between a point and a body that is no slab.
+
+    ahead: as for `hides_face`. further: how much farther away the body is, in units of both radii together.
+    """
+    if ahead > 0:
+        source = patches.entity.shape[0] + body
+        return hidden_part(world, source, patches.first_face[entity], ahead, relations)
+    return wp.clamp(0.5 + further, 0.0, 1.0)
+
+
 def make_relations(patches: Patches, entities: int, worlds: int, device: wp.Device) -> RelationTable:
     """Room for the relations of a scene's entities to the faces of its slabs."""
     faces = patches.table.entity.shape[0]

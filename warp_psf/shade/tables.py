@@ -1,4 +1,4 @@
-"""The tables that the kernels of the bounces share."""
+"""The tables that the kernels of the bounces share, and how their weights are read."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -67,8 +67,18 @@ def make_tables(order: int, functions: int) -> SimpleNamespace:
         vector: wp.array2d(dtype=wp.mat33)  # (world, glossy proxy): v after the last bounce, a row per channel
         total: wp.array2d(dtype=wp.mat33)  # (world, glossy proxy): v after all bounces so far
 
+    @wp.func
+    def light_of(world: int, entity: int, received: per_function, bodies: BodyTable) -> wp.vec3:
+        """What is received of an entity, of each of whose functions `received` is."""
+        return wp.vec3(
+            wp.dot(received, bodies.weights[world, entity, 0]),
+            wp.dot(received, bodies.weights[world, entity, 1]),
+            wp.dot(received, bodies.weights[world, entity, 2]),
+        )
+
     return SimpleNamespace(
         **vars(kit),
+        light_of=light_of,
         radiant=radiant,
         moments=moments,
         BodyTable=BodyTable,
