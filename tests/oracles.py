@@ -54,7 +54,7 @@ def world_triangles(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndar
         mesh: Mesh = scene.meshes[entity.mesh]
         vertices.append(mesh.vertices @ poses.rotation[0, index].T + poses.position[0, index])
         faces.append(mesh.faces + total)
-        geoms.append(np.full(len(mesh.vertices), entity.object_id))
+        geoms.append(np.full(len(mesh.vertices), entity.parts[0].object_id))
         total += len(mesh.vertices)
     return np.concatenate(vertices), np.concatenate(faces), np.concatenate(geoms)
 
@@ -121,17 +121,17 @@ def shade_points(renderer: Renderer, geom: str, points: np.ndarray, normals: np.
 
     In the state of the last `update_scene`, without the delta lights. The geom must not shadow itself.
     """
-    device, count = renderer._device, len(points)
-    names = [entity.name for entity in renderer._scene.entities]
+    device, count = renderer._settings.device, len(points)
+    names = [entity.name for entity in renderer._stage.scene.entities]
     receivers = make_receivers((1, count), device)
     receivers.entity.fill_(names.index(geom))
     receivers.position.assign(np.asarray(points, np.float32)[None])
     receivers.normal.assign(np.broadcast_to(normals, (1, count, 3)).astype(np.float32))
     received = [wp.zeros((1, count), dtype=wp.vec3, device=device) for _ in range(2)]
     turns = wp.full((1, count), 1, dtype=wp.int32, device=device)
-    turn_occlusion(renderer._occlusion, renderer._device_scene, device)
-    lights = (renderer._occlusion, renderer._lighting)
-    shade_direct(receivers, turns, 1, renderer._device_scene, *lights, *received, device)
+    turn_occlusion(renderer._stage.occlusion, renderer._stage.device_scene, device)
+    lights = (renderer._stage.occlusion, renderer._stage.lighting)
+    shade_direct(receivers, turns, 1, renderer._stage.device_scene, *lights, *received, device)
     return tuple(array.numpy()[0] for array in received)
 
 

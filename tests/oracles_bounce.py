@@ -68,7 +68,7 @@ def world_meshes(
             faces.append(mesh.faces + total)
             entity.append(np.full(len(mesh.faces), number, np.int32))
             total += len(mesh.vertices)
-        materials = [scene.entities[index].material for index in indices]
+        materials = [scene.entities[index].lobe for index in indices]
         colors = [np.array([getattr(m, name) for m in materials]) for name in ("albedo", "emission", "specular")]
         colors.append(np.array([m.exponent for m in materials]))
         return WorldMeshes(*map(np.concatenate, (vertices, normals, faces, entity)), *colors)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import warp_psf as psf
-import warp_psf.renderer
+import warp_psf.stage
 from sims import bodies
 from tests.oracles import make_renderer
 from tests.oracles_bounce import traced_bounces
@@ -84,7 +84,7 @@ def gather_everywhere(patch: pytest.MonkeyPatch) -> None:
     # The kernels take the spacings as they are when they are compiled, the first time that they run.
     draw(geom(BALL, "0 0 1", "pale") + geom(PILL, "0 1 1", "pale") + camera("0 -4 1", "1 0 0 0 0 1"))
     patch.setattr(last_gather, "SPACINGS", (1,))
-    patch.setattr(warp_psf.renderer, "begin_lattice", lambda lattice, *_: lattice.turns.fill_(1))
+    patch.setattr(warp_psf.stage, "begin_lattice", lambda lattice, *_: lattice.turns.fill_(1))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -109,7 +109,7 @@ def traced_radiance(
     renderer: psf.Renderer, data: mujoco.MjData, bounces: int, paths: int = 256
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which pixels show surfaces [H, W], and the radiance that each bounce of `SLANTED` adds there [bounces, N, 3]."""
-    albedo, receivers = renderer.layers()["albedo"], renderer._surfaces.receivers
+    albedo, receivers = renderer.layers()["albedo"], renderer._stage.surfaces.receivers
     pixels = HEIGHT * WIDTH
     seen = receivers.entity.numpy()[0, :pixels] >= 0
     points, normals = receivers.position.numpy()[0, :pixels], receivers.normal.numpy()[0, :pixels]

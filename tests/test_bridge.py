@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from warp_psf import bridge
+from warp_psf.bridge.shapes import INFINITE_PLANE
 from warp_psf.scene import primitives
 from warp_psf.scene.light import AreaLight, DeltaLight, area_light_entities, rectangle_light
 
@@ -69,8 +70,7 @@ def data(model) -> mujoco.MjData:
 
 @pytest.fixture(scope="module")
 def scene(model):
-    with pytest.warns(UserWarning, match=r"not supported yet: hills \(hfield\)$"):
-        return bridge.build_scene(model)
+    return bridge.build_scene(model)
 
 
 def simple(lights: str = "") -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -98,21 +98,21 @@ def free_camera(model) -> mujoco.MjvCamera:
 
 def test_entities_are_the_visible_geoms(model, scene):
     names = [entity.name for entity in scene.entities]
-    assert names == ["floor", "box", "ball", "ball2", "pill", "can", "egg", "first", "second"]
-    assert all(model.geom(entity.object_id).name == entity.name for entity in scene.entities)
-    assert {entity.object_type for entity in scene.entities} == {int(mujoco.mjtObj.mjOBJ_GEOM)}
+    assert names == ["floor", "hills", "box", "ball", "ball2", "pill", "can", "egg", "first", "second"]
+    assert all(model.geom(entity.parts[0].object_id).name == entity.name for entity in scene.entities)
+    assert {entity.parts[0].object_type for entity in scene.entities} == {int(mujoco.mjtObj.mjOBJ_GEOM)}
 
 
 def test_equal_shapes_share_a_mesh(scene):
     mesh = {entity.name: entity.mesh for entity in scene.entities}
     assert mesh["ball"] == mesh["ball2"]
     assert mesh["first"] == mesh["second"]
-    assert len(scene.meshes) == 7
+    assert len(scene.meshes) == 8
     assert scene.meshes[mesh["first"]].name == "tetra"
 
 
 def test_shapes_have_the_model_s_sizes(model, scene):
-    endless = bridge.INFINITE_PLANE * model.stat.extent
+    endless = INFINITE_PLANE * model.stat.extent
     half_extents = {
         "floor": (endless, 3.0, 0.0),
         "box": (0.1, 0.2, 0.3),
@@ -144,10 +144,10 @@ def test_meshes_lie_where_mujoco_puts_them(model, data, scene):
 def test_poses_are_mujoco_s(model, data, scene):
     poses = bridge.read_poses(model, data, scene)
     assert poses.position.dtype == poses.rotation.dtype == np.float32
-    assert poses.position.shape == (1, 9, 3)
+    assert poses.position.shape == (1, 10, 3)
     for entity, position, rotation in zip(scene.entities, poses.position[0], poses.rotation[0], strict=True):
-        np.testing.assert_allclose(position, data.geom(entity.object_id).xpos, atol=1e-6)
-        np.testing.assert_allclose(rotation.ravel(), data.geom(entity.object_id).xmat, atol=1e-6)
+        np.testing.assert_allclose(position, data.geom(entity.parts[0].object_id).xpos, atol=1e-6)
+        np.testing.assert_allclose(rotation.ravel(), data.geom(entity.parts[0].object_id).xmat, atol=1e-6)
 
 
 def test_colours_follow_mujoco_s_rule(model, data, scene):
@@ -157,19 +157,23 @@ def test_colours_follow_mujoco_s_rule(model, data, scene):
         warnings.simplefilter("ignore")
         linear = bridge.build_scene(model, material_space="linear")
     for entity in linear.entities:
-        geom = shown[entity.object_id]
+        geom = shown[entity.parts[0].object_id]
         if entity.name != "floor":
-            np.testing.assert_allclose(entity.material.albedo, geom.rgba[:3], rtol=1e-6)
-        np.testing.assert_allclose(entity.material.emission, geom.emission * geom.rgba[:3], rtol=1e-6)
-        np.testing.assert_allclose(entity.material.exponent, 32.0 * geom.shininess, rtol=1e-6)
-        np.testing.assert_allclose(entity.material.specular, 2.0 * geom.specular / (32.0 * geom.shininess + 2.0))
-    by_name = {entity.name: entity.material for entity in scene.entities}
+            np.testing.assert_allclose(entity.lobe.albedo, geom.rgba[:3], rtol=1e-6)
+            np.testing.assert_allclose(entity.lobe.specular, 2.0 * geom.specular / (32.0 * geom.shininess + 2.0))
+        np.testing.assert_allclose(entity.lobe.emission, geom.emission * geom.rgba[:3], rtol=1e-6)
+        np.testing.assert_allclose(entity.lobe.exponent, 32.0 * geom.shininess, rtol=1e-6)
+    by_name = {entity.name: entity.lobe for entity in scene.entities}
     np.testing.assert_allclose(by_name["ball"].albedo, [0.0, 0.21404114, 0.0], atol=1e-6)
 
 
-def test_a_texture_counts_with_its_mean(scene):
-    floor = next(entity.material for entity in scene.entities if entity.name == "floor")
-    np.testing.assert_allclose(floor.albedo, 0.5, atol=1e-6)
+def test_textures_are_read_once_and_stay_out_of_the_albedo(scene):
+    floor = next(entity for entity in scene.entities if entity.name == "floor")
+    np.testing.assert_allclose(floor.lobe.albedo, 1.0 - floor.lobe.specular, atol=1e-6)
+    assert [texture.name for texture in scene.textures] == ["checker"]
+    assert floor.parts[0].texture == 0
+    np.testing.assert_allclose(scene.textures[0].pixels.mean(), 127.5)
+    assert {entity.parts[0].texture for entity in scene.entities if entity is not floor} == {-1}
 
 
 def test_reflectances_never_exceed_one():
@@ -177,7 +181,7 @@ def test_reflectances_never_exceed_one():
         '<mujoco><asset><material name="m" rgba="1 .5 0 1" specular="1" shininess="0"/></asset>'
         '<worldbody><geom size="1" material="m"/></worldbody></mujoco>'
     )
-    material = bridge.build_scene(model, material_space="linear").entities[0].material
+    material = bridge.build_scene(model, material_space="linear").entities[0].lobe
     np.testing.assert_allclose(material.albedo, [0.5, 0.25, 0.0])
     np.testing.assert_allclose(material.specular, [0.5, 0.5, 0.5])
 
@@ -196,9 +200,9 @@ def test_area_lights_are_the_last_entities(model, data):
     assert [scene.entities[entity].name for _, entity in area_light_entities(scene)] == ["panel", "glow", "glow 2"]
     assert len(scene.lights) == 3
     panel, glow, glow2 = scene.entities[-3:]
-    assert panel.object_id == -1
+    assert panel.parts[0].object_id == -1
     assert glow.mesh == glow2.mesh
-    np.testing.assert_array_equal(panel.material.emission, [4.0, 3.0, 2.0])
+    np.testing.assert_array_equal(panel.lobe.emission, [4.0, 3.0, 2.0])
 
     poses = bridge.read_poses(model, data, scene)
     np.testing.assert_allclose(poses.position[0, -3], [0.0, 0.0, 2.0])

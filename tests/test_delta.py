@@ -19,8 +19,10 @@ def lit_floor(lights: str, others: str = "", floor: str = FLOOR, **options) -> t
     renderer, data = make_renderer(floor + CAMERA + lights + others, HEIGHT, WIDTH, environment=None, **options)
     renderer.update_scene(data, "down")
     layers = renderer.layers()
-    points = renderer._surfaces.receivers.position.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH, 3)
-    on_floor = (layers["segmentation"][..., 0] == 0) & (renderer._surfaces.extra.numpy().reshape(HEIGHT, WIDTH) < 0)
+    points = renderer._stage.surfaces.receivers.position.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH, 3)
+    on_floor = (layers["segmentation"][..., 0] == 0) & (
+        renderer._stage.surfaces.extra.numpy().reshape(HEIGHT, WIDTH) < 0
+    )
     return points[on_floor].astype(np.float64), layers["direct"][on_floor]
 
 

@@ -6,13 +6,14 @@ import warp_psf as psf
 from tests.oracles import make_renderer
 from warp_psf.scene import detail, primitives
 from warp_psf.scene.material import Material
-from warp_psf.scene.scene import Entity, Scene
+from warp_psf.scene.scene import Entity, Part, Scene
 
 GREY = Material(np.full(3, 0.5), np.zeros(3), 0.0, np.zeros(3))
 
 
 def scene_of(*meshes: psf.Mesh) -> Scene:
-    return Scene(meshes, tuple(Entity(mesh.name, k, GREY, k, 5) for k, mesh in enumerate(meshes)), ())
+    entities = (Entity(mesh.name, k, (Part(mesh.name, GREY, k, 5),)) for k, mesh in enumerate(meshes))
+    return Scene(meshes, tuple(entities), ())
 
 
 def longest_edge(mesh: psf.Mesh) -> float:

@@ -77,7 +77,7 @@ def glossy_ball(shininess: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, f
     seen = cosine > 0.02
     _, glossy = shade_points(renderer, "ball", normals[seen], normals[seen])
     mirrored = 2 * cosine[:, None] * normals - view
-    return glossy[:, 0], normals[seen], mirrored[seen], renderer._scene.entities[0].material.exponent
+    return glossy[:, 0], normals[seen], mirrored[seen], renderer._stage.scene.entities[0].lobe.exponent
 
 
 @pytest.mark.parametrize("shininess", [0.03125, 0.125, 1.0])
@@ -263,7 +263,7 @@ def test_lights_are_luminous_bodies_that_cast_no_shadow():
     light = psf.rectangle_light("panel", 1, 1, (3, 2, 1), (0, 0, 1), (0, 0, 0))
     lit, _ = make_renderer(FLOOR, environment=WHITE, lights=[light])
     free, _ = make_renderer(FLOOR, environment=WHITE)
-    assert [entity.name for entity in lit._scene.entities] == ["floor", "panel"]
+    assert [entity.name for entity in lit._stage.scene.entities] == ["floor", "panel"]
     assert lit.occluders == free.occluders == 1
     # The sky reaches the floor past the light, which adds to it.
     assert (shade_points(lit, "floor", GRID, UP)[0] >= shade_points(free, "floor", GRID, UP)[0] - 1e-6).all()

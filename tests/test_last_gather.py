@@ -59,8 +59,8 @@ def test_sparse_probes_show_what_a_probe_at_every_pixel_does(monkeypatch, materi
     renderer, _ = start(scene, header=SHARP)
     found = renderer.layers()
     body = found["segmentation"][..., 0] >= 0
-    assert renderer._last_gather is not None
-    assert renderer._last_gather.count < 0.25 * body.sum()
+    assert renderer._stage.last_gather is not None
+    assert renderer._stage.last_gather.count < 0.25 * body.sum()
     np.testing.assert_array_equal(found["segmentation"], expected["segmentation"])
     # Cells are halved until probes agree within 10 % of the indirect light or 2 % of all light, so that pixels between
     # them err by less than half of that, except in seams that lie between probes 2 pixels apart.
@@ -92,7 +92,7 @@ def test_thin_bodies_are_lit_on_all_their_pixels(monkeypatch):
     layers = renderer.layers()
     on_rod = layers["segmentation"][..., 0] == ROD
     assert on_rod.sum() > 40
-    receivers, pixels = renderer._surfaces.receivers, HEIGHT * WIDTH
+    receivers, pixels = renderer._stage.surfaces.receivers, HEIGHT * WIDTH
     points, normals = receivers.position.numpy()[0, :pixels], receivers.normal.numpy()[0, :pixels]
     traced = traced_bounces(
         renderer.model,

@@ -7,6 +7,7 @@ import warp as wp
 import warp_psf as psf
 from tests.oracles import make_renderer
 from warp_psf.shade import lattice
+from warp_psf.stage import make_received
 from warp_psf.shade.direct import shade_direct
 
 HEIGHT, WIDTH = 215, 381  # not multiples of the strides
@@ -34,18 +35,26 @@ def scene():
 
 def shade_everything(renderer) -> tuple[np.ndarray, np.ndarray]:
     """Irradiance and Phong radiance [slots, 3] of the last picture, with every receiver shaded."""
-    turns = wp.full((1, renderer._surfaces.slots), 1, dtype=wp.int32, device=renderer._device)
-    received = renderer._make_received(renderer._surfaces.slots)
-    lights = (renderer._occlusion, renderer._lighting)
-    shade_direct(renderer._surfaces.receivers, turns, 1, renderer._device_scene, *lights, *received, renderer._device)
+    turns = wp.full((1, renderer._stage.surfaces.slots), 1, dtype=wp.int32, device=renderer._settings.device)
+    received = make_received(renderer._stage.surfaces.slots, renderer._settings.device)
+    lights = (renderer._stage.occlusion, renderer._stage.lighting)
+    shade_direct(
+        renderer._stage.surfaces.receivers,
+        turns,
+        1,
+        renderer._stage.device_scene,
+        *lights,
+        *received,
+        renderer._settings.device,
+    )
     return received[0].numpy()[0], received[1].numpy()[0]
 
 
 def test_interpolated_light_is_nearly_that_of_every_pixel(scene):
-    entity = scene._surfaces.receivers.entity.numpy()[0]
-    turns = scene._lattice.turns.numpy()[0]
+    entity = scene._stage.surfaces.receivers.entity.numpy()[0]
+    turns = scene._stage.lattice.turns.numpy()[0]
     # Cells that are interpolated bend by 0.5 % between their corners as far as the lattice can tell.
-    for found, full in zip(scene._received, shade_everything(scene), strict=True):
+    for found, full in zip(scene._stage.received, shade_everything(scene), strict=True):
         seen = entity >= 0
         error = np.abs(found.numpy()[0] - full)[seen] / full[seen].max()
         interpolated = turns[seen] == lattice.INTERPOLATED
@@ -55,12 +64,12 @@ def test_interpolated_light_is_nearly_that_of_every_pixel(scene):
 
 
 def test_every_receiver_gets_its_turn(scene):
-    entity = scene._surfaces.receivers.entity.numpy()[0]
-    turns = scene._lattice.turns.numpy()[0]
+    entity = scene._stage.surfaces.receivers.entity.numpy()[0]
+    turns = scene._stage.lattice.turns.numpy()[0]
     assert np.isin(turns, (1, 2, 3, lattice.INTERPOLATED)).all()
     assert (turns[entity < 0] == lattice.INTERPOLATED).all()
     # Edge pixels and their groups are shaded.
-    extra = scene._surfaces.extra.numpy()[0]
+    extra = scene._stage.surfaces.extra.numpy()[0]
     edges = np.flatnonzero((extra >= 0) & (entity[: len(extra)] >= 0))
     assert len(edges) > 50
     assert (turns[edges] == 1).all()
@@ -70,14 +79,14 @@ def test_every_receiver_gets_its_turn(scene):
 
 def test_a_valley_between_equal_corners_is_seen(scene):
     # Light that is low along a line halfway between the lattice's columns 40 and 44, and equal on both.
-    pixels, device = scene._surfaces.receivers, scene._device
-    lattice.begin_lattice(scene._lattice, pixels, scene._surfaces.extra, device)
-    x = np.arange(scene._surfaces.slots) % WIDTH
+    pixels, device = scene._stage.surfaces.receivers, scene._settings.device
+    lattice.begin_lattice(scene._stage.lattice, pixels, scene._stage.surfaces.extra, device)
+    x = np.arange(scene._stage.surfaces.slots) % WIDTH
     valley = (1 + 0.0105 * np.abs(x - 42.0))[:, None] * np.ones(3)
-    received = scene._make_received(scene._surfaces.slots)
+    received = make_received(scene._stage.surfaces.slots, scene._settings.device)
     received[0].assign(valley.astype(np.float32)[None])
-    lattice.refine_lattice(scene._lattice, 1, pixels, *received, device)
-    turns = scene._lattice.turns.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
+    lattice.refine_lattice(scene._stage.lattice, 1, pixels, *received, device)
+    turns = scene._stage.lattice.turns.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
     floor = (pixels.entity.numpy()[0, : HEIGHT * WIDTH] == 0).reshape(HEIGHT, WIDTH)
     assert floor[-40:, 30:60].all()
     assert (turns[-40:, 41:44] != lattice.INTERPOLATED).all()
@@ -85,31 +94,31 @@ def test_a_valley_between_equal_corners_is_seen(scene):
 
 
 def test_noise_is_never_interpolated(scene):
-    pixels = scene._surfaces.receivers
-    lattice.begin_lattice(scene._lattice, pixels, scene._surfaces.extra, scene._device)
-    noise = np.random.default_rng(1).uniform(1, 2, (1, scene._surfaces.slots, 3)).astype(np.float32)
-    received = scene._make_received(scene._surfaces.slots)
+    pixels = scene._stage.surfaces.receivers
+    lattice.begin_lattice(scene._stage.lattice, pixels, scene._stage.surfaces.extra, scene._settings.device)
+    noise = np.random.default_rng(1).uniform(1, 2, (1, scene._stage.surfaces.slots, 3)).astype(np.float32)
+    received = make_received(scene._stage.surfaces.slots, scene._settings.device)
     for array in received:
         array.assign(noise)
     for turn in (1, 2):
-        lattice.refine_lattice(scene._lattice, turn, pixels, *received, scene._device)
-    turns = scene._lattice.turns.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
+        lattice.refine_lattice(scene._stage.lattice, turn, pixels, *received, scene._settings.device)
+    turns = scene._stage.lattice.turns.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
     entity = pixels.entity.numpy()[0, : HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)
     assert (turns[entity >= 0] != lattice.INTERPOLATED).all()
     np.testing.assert_array_equal(received[0].numpy()[0], noise[0])
 
 
 def test_linear_light_is_interpolated_exactly(scene):
-    pixels, device = scene._surfaces.receivers, scene._device
-    lattice.begin_lattice(scene._lattice, pixels, scene._surfaces.extra, device)
-    y, x = np.divmod(np.arange(scene._surfaces.slots), WIDTH)
+    pixels, device = scene._stage.surfaces.receivers, scene._settings.device
+    lattice.begin_lattice(scene._stage.lattice, pixels, scene._stage.surfaces.extra, device)
+    y, x = np.divmod(np.arange(scene._stage.surfaces.slots), WIDTH)
     ramp = (10 + 0.02 * x + 0.01 * y)[:, None] * np.ones(3)
-    first = scene._lattice.turns.numpy()[0] == 1
-    received = scene._make_received(scene._surfaces.slots)
+    first = scene._stage.lattice.turns.numpy()[0] == 1
+    received = make_received(scene._stage.surfaces.slots, scene._settings.device)
     for array in received:
         array.assign((ramp * first[:, None]).astype(np.float32)[None])
-    lattice.refine_lattice(scene._lattice, 1, pixels, *received, device)
-    done = scene._lattice.turns.numpy()[0] == lattice.INTERPOLATED
+    lattice.refine_lattice(scene._stage.lattice, 1, pixels, *received, device)
+    done = scene._stage.lattice.turns.numpy()[0] == lattice.INTERPOLATED
     done &= pixels.entity.numpy()[0] >= 0
     assert done.sum() > 1000
     for array in received:
@@ -121,9 +130,9 @@ def test_pictures_smaller_than_a_cell(height, width):
     renderer, data = make_renderer(SCENE, height, width, environment=sky())
     renderer.update_scene(data, "front")
     layers = renderer.layers()
-    entity = renderer._surfaces.receivers.entity.numpy()[0] >= 0
+    entity = renderer._stage.surfaces.receivers.entity.numpy()[0] >= 0
     np.testing.assert_allclose(
-        renderer._received[0].numpy()[0][entity], shade_everything(renderer)[0][entity], rtol=5e-3
+        renderer._stage.received[0].numpy()[0][entity], shade_everything(renderer)[0][entity], rtol=5e-3
     )
     assert layers["color"].shape == (height, width, 3)
     assert (layers["color"] > 0).all()

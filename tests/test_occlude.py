@@ -140,14 +140,14 @@ def still_life():
 def test_against_ray_casting(still_life):
     renderer, data = still_life
     renderer.layers()
-    receivers = renderer._surfaces.receivers
+    receivers = renderer._stage.surfaces.receivers
     pixels = 54 * 96
     entity, position, normal = (
         getattr(receivers, name).numpy()[0, :pixels] for name in ("entity", "position", "normal")
     )
     seen = entity >= 0
     assert len(np.unique(entity)) == 5
-    found = renderer._received[0].numpy()[0, :pixels][seen]
+    found = renderer._stage.received[0].numpy()[0, :pixels][seen]
     expected = traced_irradiance(renderer.model, data, position[seen], normal[seen], sky(4))
     # As the accuracy benchmark measures: the reference at mean luminance 0.5, both clamped to [0, 1].
     scale = 0.5 / (expected @ (0.2126, 0.7152, 0.0722)).mean()

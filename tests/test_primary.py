@@ -59,7 +59,7 @@ def test_depth_and_normals_of_a_sphere(seen):
     outward = (points - (-0.5, 0, 0.8))[ball]
     # The icosphere's flat faces lie within 0.2 % of its radius below the sphere, its normals within a degree.
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 0.8, rtol=3e-3)
-    inner = (renderer._surfaces.extra.numpy().reshape(ball.shape) < 0)[ball]  # else a normal is a mean of several
+    inner = (renderer._stage.surfaces.extra.numpy().reshape(ball.shape) < 0)[ball]  # else a normal is a mean of several
     assert inner.sum() > 100
     cosine = np.sum(layers["normal"][ball] * outward, axis=1) / np.linalg.norm(outward, axis=1)
     assert cosine[inner].min() > np.cos(np.radians(2))
@@ -134,9 +134,9 @@ def test_edges_are_antialiased(degrees):
 def test_no_offsamples_no_antialiasing(seen):
     _, _, smooth = seen
     renderer, _, aliased = picture(SCENE, "front", header=ALIASED)
-    assert (renderer._surfaces.extra.numpy() == -1).all()
-    assert renderer._surfaces.slots == HEIGHT * WIDTH
-    colors = [np.float32(entity.material.albedo[1]) for entity in renderer._scene.entities]
+    assert (renderer._stage.surfaces.extra.numpy() == -1).all()
+    assert renderer._stage.surfaces.slots == HEIGHT * WIDTH
+    colors = [np.float32(entity.lobe.albedo[1]) for entity in renderer._stage.scene.entities]
     assert np.isin(aliased["albedo"][..., 1], [0, *colors]).all()
     assert not np.isin(smooth["albedo"][..., 1], [0, *colors]).all()
     # Depth and segmentation are those of the centre, with antialiasing or without.
@@ -146,9 +146,9 @@ def test_no_offsamples_no_antialiasing(seen):
 
 def weights_of(renderer) -> np.ndarray:
     """The sum of each pixel's shares [pixels]."""
-    receivers = renderer._surfaces.receivers
+    receivers = renderer._stage.surfaces.receivers
     weight = np.where(receivers.entity.numpy()[0] >= 0, receivers.weight.numpy()[0], 0.0)
-    extra = renderer._surfaces.extra.numpy()[0]
+    extra = renderer._stage.surfaces.extra.numpy()[0]
     total = weight[: len(extra)].copy()
     for group in range(EXTRA_GROUPS):
         total[extra >= 0] += weight[extra[extra >= 0] + group]
@@ -189,9 +189,9 @@ def test_more_edges_than_there_is_room_for():
         for y in range(14)
     )
     renderer, _, layers = picture(balls + DOWN, "down", 27, 48)
-    edges = int(renderer._surfaces.edge.numpy().sum())
-    assert edges > renderer._surfaces.edge_capacity
-    assert (renderer._surfaces.extra.numpy() >= 0).sum() == renderer._surfaces.edge_capacity
+    edges = int(renderer._stage.surfaces.edge.numpy().sum())
+    assert edges > renderer._stage.surfaces.edge_capacity
+    assert (renderer._stage.surfaces.extra.numpy() >= 0).sum() == renderer._stage.surfaces.edge_capacity
     assert weights_of(renderer).max() <= 1 + 1e-6
     # Balls take pi/4 (6/8)^2 of their cells, which take 1.92 m x 1.12 m of the picture's 2.95 m x 1.66 m.
     assert layers["albedo"].mean() == pytest.approx(0.44 * 1.92 * 1.12 / (2.95 * 1.66), rel=0.1)

@@ -236,7 +236,7 @@ def test_a_small_motion_changes_little(scene):
     renderer.update_scene(data, "front")
     after = renderer.layers()
     data.mocap_pos[0] -= (6e-4, 0, 0)
-    smooth = (renderer._surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH)
+    smooth = (renderer._stage.surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH)
     change = np.abs(after["color"] - before["color"]).max(axis=2)
     assert change[smooth].max() < 0.02
     assert change.max() < 0.25
@@ -295,11 +295,11 @@ def test_bounced_light_is_a_layer_of_the_color(scene):
     layers = renderer.layers()
     body = layers["segmentation"][..., 0] >= 0
     # Nothing here emits, and edges mix in some background: away from them the two layers are all.
-    inner = (renderer._surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH) & body
+    inner = (renderer._stage.surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH) & body
     total = layers["direct"] + layers["indirect"]
     assert layers["color"][inner] == pytest.approx(total[inner], rel=1e-5)
     assert layers["indirect"][inner].max() > 0.01
-    assert not layers["indirect"][~body & (renderer._surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH)].any()
+    assert not layers["indirect"][~body & (renderer._stage.surfaces.extra.numpy() < 0).reshape(HEIGHT, WIDTH)].any()
 
 
 @pytest.mark.parametrize("shading", ["pixel", "vertex"])

@@ -87,7 +87,7 @@ def beam() -> psf.Environment:
 def wall_light(body: str, exponent: float, bounces: int) -> tuple[np.ndarray, tuple]:
     """The irradiance [N] of bounced light at pixels of the wall, and what `traced_light` asks for."""
     renderer, data = start(body, header=shiny(exponent), environment=beam(), bounces=bounces)
-    layers, receivers = renderer.layers(), renderer._surfaces.receivers
+    layers, receivers = renderer.layers(), renderer._stage.surfaces.receivers
     chosen = np.flatnonzero(shown(layers, 0))[::STEP]
     pixels = HEIGHT * WIDTH
     points, normals = (array.numpy()[0, :pixels][chosen] for array in (receivers.position, receivers.normal))
@@ -151,7 +151,7 @@ def test_a_glossy_body_in_a_furnace():
     white = psf.Environment.from_coefficients(coefficients)
     body = WALL + geom(BALL, ".2 0 .7", "shiny") + EYE
     renderer, data = start(body, header=shiny(2.56), environment=white, bounces=1)
-    receivers = renderer._surfaces.receivers
+    receivers = renderer._stage.surfaces.receivers
     layers = renderer.layers()
     points, normals = (a.numpy()[0, : HEIGHT * WIDTH][::7] for a in (receivers.position, receivers.normal))
     options = {"bounces": 1, "coefficients": coefficients, "paths": 4096, "phong": True, "material_space": "linear"}
@@ -162,8 +162,8 @@ def test_a_glossy_body_in_a_furnace():
 
 def test_scenes_without_gloss_pay_nothing():
     renderer, _ = start(WALL + geom(BALL, ".2 0 .7", "red") + EYE, environment=beam())
-    assert renderer._bounces is not None
-    table = renderer._bounces.gloss.table
+    assert renderer._stage.bounces is not None
+    table = renderer._stage.bounces.gloss.table
     for array in (table.first, table.second, table.extra, table.vector, table.entity):
         assert array.size == 0
 

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.film.primary import EXTRA_GROUPS, SAMPLES, CameraTable, Surfaces, camera_ray
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
 from warp_psf.scene.receiver import ReceiverTable
 
 
@@ -104,14 +104,15 @@ def _resolve_pixels(
         entity = receivers.entity[world, slot]
         if entity >= 0:
             weight = receivers.weight[world, slot]
-            reflectance = geometry.albedo[entity]
+            part = part_of(geometry, entity, receivers.face[world, slot])
+            reflectance = geometry.albedo[part]
             lobe = geometry.specular[entity]
             lambert = reflectance * wp.static(1.0 / math.pi)
             light += weight * (wp.cw_mul(lambert, diffuse[world, slot]) + wp.cw_mul(lobe, glossy[world, slot]))
             bounced += weight * (
                 wp.cw_mul(lambert, indirect_diffuse[world, slot]) + wp.cw_mul(lobe, indirect_glossy[world, slot])
             )
-            emission = geometry.emission[entity]
+            emission = geometry.emission[part]
             if wp.max(emission) > 0.0:
                 # Surfaces shine from their fronts.
                 shine += wp.where(shows_front(receivers, world, slot, geometry, poses), weight, 0.0) * emission
@@ -133,7 +134,8 @@ def _resolve_pixels(
     entity = receivers.entity[world, pixel]
     if entity >= 0:
         depth = receivers.depth[world, pixel]
-        objects = wp.vec2i(geometry.object_id[entity], geometry.object_type[entity])
+        part = part_of(geometry, entity, receivers.face[world, pixel])
+        objects = wp.vec2i(geometry.object_id[part], geometry.object_type[part])
     layers.depth[world, pixel] = depth
     layers.segmentation[world, pixel] = objects
 

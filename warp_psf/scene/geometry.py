@@ -25,12 +25,16 @@ class GeometryTable:
     lower: wp.array(dtype=wp.vec3)  # (entity): corners of the bounding box, in the entity's frame
     upper: wp.array(dtype=wp.vec3)  # (entity)
     convex: wp.array(dtype=wp.bool)  # (entity)
-    albedo: wp.array(dtype=wp.vec3)  # (entity)
+    opacity: wp.array(dtype=wp.float32)  # (entity), in (0, 1]
     specular: wp.array(dtype=wp.vec3)  # (entity)
     exponent: wp.array(dtype=wp.float32)  # (entity)
-    emission: wp.array(dtype=wp.vec3)  # (entity)
-    object_id: wp.array(dtype=wp.int32)  # (entity)
-    object_type: wp.array(dtype=wp.int32)  # (entity)
+    first_part: wp.array(dtype=wp.int32)  # (entity)
+    first_face_part: wp.array(dtype=wp.int32)  # (entity): its first place in face_part, -1 when it has one part
+    face_part: wp.array(dtype=wp.int32)  # (face of an entity with several parts): counted from the first part
+    albedo: wp.array(dtype=wp.vec3)  # (part)
+    emission: wp.array(dtype=wp.vec3)  # (part)
+    object_id: wp.array(dtype=wp.int32)  # (part)
+    object_type: wp.array(dtype=wp.int32)  # (part)
 
 
 @wp.struct
@@ -51,6 +55,15 @@ def may_hit(geometry: GeometryTable, entity: int, origin: wp.vec3, direction: wp
     enter = wp.max(wp.min(near, far))
     leave = wp.min(wp.max(near, far)) * 1.000001
     return not (leave < wp.max(enter, 0.0) or enter > farthest)
+
+
+@wp.func
+def part_of(geometry: GeometryTable, entity: int, face: int) -> int:
+    """The part that a face of an entity's mesh belongs to."""
+    part = geometry.first_part[entity]
+    if geometry.first_face_part[entity] >= 0:
+        part += geometry.face_part[geometry.first_face_part[entity] + face]
+    return part
 
 
 @dataclass(frozen=True)
@@ -81,7 +94,7 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     table.faces = wp.array(faces, dtype=wp.vec3i, device=device)
 
     shapes: list[Mesh] = [scene.meshes[entity.mesh] for entity in scene.entities]
-    materials = [entity.material for entity in scene.entities]
+    lobes = [entity.lobe for entity in scene.entities]
 
     def per_entity(values: list, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=device)
@@ -92,17 +105,33 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     table.lower = per_entity([wp.vec3(*map(float, mesh.vertices.min(axis=0))) for mesh in shapes], wp.vec3)
     table.upper = per_entity([wp.vec3(*map(float, mesh.vertices.max(axis=0))) for mesh in shapes], wp.vec3)
     table.convex = per_entity([mesh.convex for mesh in shapes], wp.bool)
-    table.albedo = per_entity([wp.vec3(*map(float, material.albedo)) for material in materials], wp.vec3)
-    table.specular = per_entity([wp.vec3(*map(float, material.specular)) for material in materials], wp.vec3)
-    table.exponent = per_entity([float(material.exponent) for material in materials], wp.float32)
-    table.emission = per_entity([wp.vec3(*map(float, material.emission)) for material in materials], wp.vec3)
-    table.object_id = per_entity([entity.object_id for entity in scene.entities], wp.int32)
-    table.object_type = per_entity([entity.object_type for entity in scene.entities], wp.int32)
+    table.opacity = per_entity([entity.opacity for entity in scene.entities], wp.float32)
+    table.specular = per_entity([wp.vec3(*map(float, lobe.specular)) for lobe in lobes], wp.vec3)
+    table.exponent = per_entity([float(lobe.exponent) for lobe in lobes], wp.float32)
+    _upload_parts(table, scene, device)
 
     poses = PoseTable()
     poses.position = wp.zeros((worlds, len(scene.entities)), dtype=wp.vec3, device=device)
     poses.rotation = wp.zeros((worlds, len(scene.entities)), dtype=wp.mat33, device=device)
     return DeviceScene(table, poses, meshes)
+
+
+def _upload_parts(table: GeometryTable, scene: Scene, device: wp.Device) -> None:
+    """Fills the table's arrays over parts."""
+    parts = [part for entity in scene.entities for part in entity.parts]
+    maps = [entity.face_part for entity in scene.entities]
+    counts = np.array([0 if faces is None else len(faces) for faces in maps], np.int64)
+    first = np.where(counts > 0, np.cumsum(counts) - counts, -1)
+    table.first_part = wp.array(_starts(entity.parts for entity in scene.entities), dtype=wp.int32, device=device)
+    table.first_face_part = wp.array(first, dtype=wp.int32, device=device)
+    given = [np.zeros(0, np.int32), *(faces for faces in maps if faces is not None)]
+    table.face_part = wp.array(np.concatenate(given), dtype=wp.int32, device=device)
+    albedo = np.array([part.material.albedo for part in parts], np.float32).reshape(-1, 3)
+    emission = np.array([part.material.emission for part in parts], np.float32).reshape(-1, 3)
+    table.albedo = wp.array(albedo, dtype=wp.vec3, device=device)
+    table.emission = wp.array(emission, dtype=wp.vec3, device=device)
+    table.object_id = wp.array([part.object_id for part in parts], dtype=wp.int32, device=device)
+    table.object_type = wp.array([part.object_type for part in parts], dtype=wp.int32, device=device)
 
 
 def write_poses(device_scene: DeviceScene, poses: Poses) -> None:

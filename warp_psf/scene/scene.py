@@ -9,32 +9,62 @@ import numpy as np
 from warp_psf.scene.light import Light
 from warp_psf.scene.material import Material
 from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.texture import Texture
 
 
 @dataclass(frozen=True)
+class Part:
+    """What a viewer tells apart on an entity: a geom of MuJoCo's, with its look.
+
+    name: what messages call it.
+    material: its reflectance and emission; a texture multiplies the albedo and the emission.
+    object_id, object_type: MuJoCo's id and type (mjtObj) of the thing, for the segmentation layer.
+    texture: index into `Scene.textures`, -1 for none.
+    """
+
+    name: str
+    material: Material
+    object_id: int
+    object_type: int
+    texture: int = -1
+
+
+@dataclass(frozen=True, eq=False)
 class Entity:
-    """One rigid thing that is seen, shaded and casts shadows.
+    """One rigid thing that is seen and shaded, and that casts shadows and reflects light.
 
     name: what messages call it.
     mesh: index into `Scene.meshes`; entities with the same shape share a mesh.
-    material: its reflectance and emission.
-    object_id, object_type: MuJoCo's id and type (mjtObj) of the thing, for the segmentation layer.
+    parts: one, or several where geoms of one body have one shape together; their lobes are the first one's.
+    face_part: which part each face of the mesh belongs to, int32 [F]; None when there is only one.
+    texture_coordinates: of each face's corners, float32 [F, 3, 3]: (s, t, 0) in a flat texture, a direction in a cube;
+        None without a texture.
+    opacity: the share of light that it stops, in (0, 1].
+    casts: False for what is only seen: it takes no light from others and sends none.
     """
 
     name: str
     mesh: int
-    material: Material
-    object_id: int
-    object_type: int
+    parts: tuple[Part, ...]
+    face_part: np.ndarray | None = None
+    texture_coordinates: np.ndarray | None = None
+    opacity: float = 1.0
+    casts: bool = True
+
+    @property
+    def lobe(self) -> Material:
+        """The material whose Phong lobe holds for all parts."""
+        return self.parts[0].material
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The unchanging part: shapes, entities and the lights that move with them."""
+    """The unchanging part: shapes, entities, their textures, and the lights that move with them."""
 
     meshes: tuple[Mesh, ...]
     entities: tuple[Entity, ...]
     lights: tuple[Light, ...]
+    textures: tuple[Texture, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.field.radiance import SummedFields
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import make_between, overlap
 from warp_psf.shade.direct import DirectState
@@ -147,6 +147,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         proxies: ReceiverTable,
         geometry: GeometryTable,
         irradiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
+        tint: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         gloss: GlossTable,
         radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         total_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
@@ -156,15 +157,19 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         entity = proxies.entity[world, proxy]
         radiance = wp.vec3()
         if entity >= 0:
-            reflectance = geometry.albedo[entity] + geometry.specular[entity]
-            radiance = geometry.emission[entity] + wp.cw_mul(reflectance, irradiance[world, proxy]) / wp.pi
+            part = part_of(geometry, entity, proxies.face[world, proxy])
+            albedo = wp.cw_mul(tint[world, proxy], geometry.albedo[part])
+            shine = wp.cw_mul(tint[world, proxy], geometry.emission[part])
+            reflectance = albedo + geometry.specular[entity]
+            radiance = shine + wp.cw_mul(reflectance, irradiance[world, proxy]) / wp.pi
             if gloss.place[proxy] >= 0:
-                radiance = geometry.emission[entity] + kit.leave_glossy(
+                radiance = shine + kit.leave_glossy(
                     world,
                     gloss.place[proxy],
                     entity,
                     proxies.normal[world, proxy],
                     irradiance[world, proxy],
+                    albedo,
                     geometry,
                     gloss,
                 )
@@ -181,6 +186,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         patches: PatchTable,
         bodies: BodyTable,
         kept: KeptTable,
+        tint: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         gloss: GlossTable,
         first_texel: int,
         radiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
@@ -208,12 +214,13 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             irradiance += kit.sum_rgb(kept.transport[world, station, place], shown)
         if bodies.field[own] >= 0:
             irradiance += kit.light_of(world, own, bodies.own[proxy], bodies)
-        reflectance = geometry.albedo[own] + geometry.specular[own]
+        plain = geometry.albedo[part_of(geometry, own, proxies.face[world, proxy])]
         irradiance = wp.max(irradiance, wp.vec3())
-        radiance = wp.cw_mul(reflectance, irradiance) / wp.pi
-        if gloss.place[proxy] >= 0:
-            radiance = kit.leave_glossy(world, gloss.place[proxy], own, normal, irradiance, geometry, gloss)
         if proxy < first_texel:
+            albedo = wp.cw_mul(tint[world, proxy], plain)
+            radiance = wp.cw_mul(albedo + geometry.specular[own], irradiance) / wp.pi
+            if gloss.place[proxy] >= 0:
+                radiance = kit.leave_glossy(world, gloss.place[proxy], own, normal, irradiance, albedo, geometry, gloss)
             radiance_out[world, proxy] = radiance
             total_out[world, proxy] = total_out[world, proxy] + radiance
             return
@@ -221,6 +228,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         for y in range(block[3]):
             for x in range(block[2]):
                 texel = first_texel + block[0] + y * block[1] + x
+                albedo = wp.cw_mul(tint[world, texel], plain)
+                radiance = wp.cw_mul(albedo + geometry.specular[own], irradiance) / wp.pi
                 radiance_out[world, texel] = radiance
                 total_out[world, texel] = total_out[world, texel] + radiance
 
@@ -315,6 +324,7 @@ class BounceState:
     own_functions: wp.array
     own_light: wp.array  # vec3 (world, own vertex): irradiance there from the body itself
     turns: wp.array  # int32 (world, proxy): 1, but 0 for proxies of glossy bodies, which `shade_moments` shades
+    tint: wp.array  # vec3 (world, proxy): what a texture multiplies its albedo with
     received: tuple[wp.array, wp.array]  # irradiance and Phong radiance of direct light
     radiance: wp.array  # vec3 (world, proxy): the light that leaves after the last bounce
     total: wp.array  # vec3 (world, proxy): and after all bounces so far
@@ -357,14 +367,14 @@ def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, ti
     shape, patches = state.turns.shape, state.patches
     outputs, gloss = [state.radiance, state.total], state.gloss
     gloss.table.total.zero_()
-    inputs = [state.proxies, scene.geometry, state.received[0], gloss.table]
+    inputs = [state.proxies, scene.geometry, state.received[0], state.tint, gloss.table]
     launch(kit.leave_surface, shape, inputs, outputs, device)
     for _ in range(times - 1):
         _represent(state, state.radiance, gloss.table.vector, device)
         inputs = [state.proxies, scene.geometry, scene.poses, occlusion.table, patches.table, state.bodies, state.kept]
         launch(kit.add_gloss, gloss.table.extra.shape, [state.bodies, state.kept, gloss.table], [], device)
         launch(kit.gather_moments, gloss.table.vector.shape, [*inputs, gloss.table], [], device)
-        inputs += [gloss.table, state.first_texel]
+        inputs += [state.tint, gloss.table, state.first_texel]
         launch(kit.bounce_light, state.kept.count.shape, inputs, outputs, device)
     _represent(state, state.total, gloss.table.total, device)
     inputs = [state.bodies, state.own_entities, state.own_rows, state.own_functions]

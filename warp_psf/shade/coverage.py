@@ -33,7 +33,7 @@ def make_coverage(order: int) -> SimpleNamespace:
         """How each entity is looked up."""
 
         shape: wp.array(dtype=wp.int32)  # (entity): one of the *_SHAPE constants
-        casts: wp.array(dtype=wp.bool)  # (entity): False for lights and for what casts no shadow
+        opacity: wp.array(dtype=wp.float32)  # (entity): share of light it stops; 0 for lights and what casts no shadow
         field: wp.array(dtype=wp.int32)  # (entity): index into the field table
         slab_center: wp.array(dtype=wp.vec3)  # (entity), in the entity's frame
         slab_rotation: wp.array(dtype=wp.mat33)  # (entity), entity_from_slab

@@ -42,20 +42,21 @@ class DeltaLightTable:
 
 
 @wp.func
-def is_blocked(
+def share_passed(
     world: int,
     own: int,
     p: wp.vec3,
     toward: wp.vec3,
     geometry: GeometryTable,
     poses: PoseTable,
-    casts: wp.array(dtype=wp.bool),  # (entity)
+    opacity: wp.array(dtype=wp.float32),  # (entity)
     shadows_itself: wp.array(dtype=wp.bool),  # (entity)
-) -> bool:
-    """Whether anything stands on the segment from p to p + toward, which starts on the entity `own`."""
+) -> float:
+    """The share of light that what stands on the segment from p to p + toward, which starts on `own`, lets through."""
+    passed = float(1.0)
     length_squared = wp.dot(toward, toward)
     for entity in range(geometry.entity_mesh.shape[0]):
-        if casts[entity] and (entity != own or shadows_itself[entity]):
+        if opacity[entity] > 0.0 and (entity != own or shadows_itself[entity]):
             position = poses.position[world, entity]
             rotation = poses.rotation[world, entity]
             radius = geometry.radius[entity]
@@ -70,8 +71,10 @@ def is_blocked(
                     inverse * toward,
                     1.0,
                 ):
-                    return True
-    return False
+                    passed *= 1.0 - opacity[entity]
+                    if passed <= 0.0:
+                        return 0.0
+    return passed
 
 
 @wp.func
@@ -91,7 +94,7 @@ def delta_light(
     n: wp.vec3,
     geometry: GeometryTable,
     poses: PoseTable,
-    casts: wp.array(dtype=wp.bool),  # (entity)
+    opacity: wp.array(dtype=wp.float32),  # (entity)
     lights: DeltaLightTable,
     far: float,
 ):
@@ -125,21 +128,22 @@ def delta_light(
             if radius > 0.0 and kind != wp.static(KINDS["directional"]):
                 # A disc that faces the receiver stands for the bulb.
                 disc = sphere.frame_of(unit)
-                open_rays = int(0)
+                open_rays = float(0.0)
                 cast = int(0)
                 rays = int(wp.static(BULB_RAYS))
                 for ray in range(rays):
                     # Steps of 29 through 48 visit every place once, and any twelve in a row are spread out.
                     place = bulb_point((ray * 29) % wp.static(BULB_RAYS), wp.static(BULB_RAYS))
-                    decided = ray >= wp.static(FIRST_BULB_RAYS) and (open_rays == 0 or open_rays == cast)
+                    decided = ray >= wp.static(FIRST_BULB_RAYS) and (open_rays == 0.0 or open_rays == float(cast))
                     if not decided:
                         aimed = toward + radius * (disc * wp.vec3(place[0], place[1], 0.0))
                         cast += 1
-                        if not is_blocked(world, entity, origin, aimed, geometry, poses, casts, lights.shadows_itself):
-                            open_rays += 1
-                lit = float(open_rays) / float(cast)
-            elif is_blocked(world, entity, origin, toward, geometry, poses, casts, lights.shadows_itself):
-                lit = 0.0
+                        open_rays += share_passed(
+                            world, entity, origin, aimed, geometry, poses, opacity, lights.shadows_itself
+                        )
+                lit = open_rays / float(cast)
+            else:
+                lit = share_passed(world, entity, origin, toward, geometry, poses, opacity, lights.shadows_itself)
     return unit, strength, lit, cosine
 
 
@@ -149,7 +153,7 @@ def _add_delta_lights(
     receivers: ReceiverTable,
     geometry: GeometryTable,
     poses: PoseTable,
-    casts: wp.array(dtype=wp.bool),  # (entity)
+    opacity: wp.array(dtype=wp.float32),  # (entity)
     eye: wp.array(dtype=wp.vec3),  # (world)
     lights: DeltaLightTable,
     far: float,
@@ -170,7 +174,7 @@ def _add_delta_lights(
     glossy = wp.vec3()
     for light in range(lights.kind.shape[1]):
         diffuse += wp.static(math.pi) * lights.ambient[world, light]
-        unit, strength, lit, cosine = delta_light(world, light, entity, p, n, geometry, poses, casts, lights, far)
+        unit, strength, lit, cosine = delta_light(world, light, entity, p, n, geometry, poses, opacity, lights, far)
         if lit > 0.0:
             diffuse += (wp.static(math.pi) * strength * lit * cosine) * lights.diffuse[world, light]
             aligned = wp.dot(mirrored, unit)
@@ -233,7 +237,7 @@ def write_delta_lights(state: DeltaState, worlds: Sequence[Sequence[DeltaLight]]
 def add_delta_lights(
     receivers: ReceiverTable,
     scene: DeviceScene,
-    casts: wp.array,
+    opacity: wp.array,
     eye: wp.array,
     lights: DeltaState,
     diffuse: wp.array,
@@ -243,5 +247,5 @@ def add_delta_lights(
     """Adds the delta lights to the receivers' irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, slot)."""
     if lights.table.kind.shape[1] == 0:
         return
-    inputs = [receivers, scene.geometry, scene.poses, casts, eye, lights.table, lights.far]
+    inputs = [receivers, scene.geometry, scene.poses, opacity, eye, lights.table, lights.far]
     launch(_add_delta_lights, diffuse.shape, inputs, [diffuse, glossy], device)

@@ -296,7 +296,7 @@ def upload_lighting(
         total += 0 if pair is None else len(pair[0])
     first = [starts[entity.mesh] for entity in scene.entities]
     table.first_transfer = wp.array(first, dtype=wp.int32, device=device)
-    lobes = [legendre_series(sh.phong_lobe(entity.material.exponent, order + 1)) for entity in scene.entities]
+    lobes = [legendre_series(sh.phong_lobe(entity.lobe.exponent, order + 1)) for entity in scene.entities]
     table.lobe = wp.array(np.array(lobes, np.float32).reshape(-1, order + 1), dtype=kit.profile, device=device)
     return DirectState(order, table)
 

@@ -82,13 +82,13 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         entity: int,
         n: wp.vec3,
         irradiance: wp.vec3,
+        albedo: wp.vec3,
         geometry: GeometryTable,
         gloss: GlossTable,
     ) -> wp.vec3:
         """Notes the vector of the light that a glossy proxy reflects; returns the radiance as if it left evenly."""
         factors = gloss.factors[gloss.row[entity]]
         moment = gloss.moment[world, place]
-        albedo = geometry.albedo[entity]
         specular = geometry.specular[entity]
         even = wp.vec3()
         vector = wp.mat33()
@@ -163,7 +163,7 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         proxies: ReceiverTable,
         geometry: GeometryTable,
         poses: PoseTable,
-        casts: wp.array(dtype=wp.bool),  # (entity)
+        opacity: wp.array(dtype=wp.float32),  # (entity)
         lights: DeltaLightTable,
         far: float,
         gloss: GlossTable,
@@ -178,7 +178,7 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         for light in range(lights.kind.shape[1]):
             # Light that comes evenly from everywhere: the moment is two thirds of the irradiance.
             moment += wp.outer(2.0 / 3.0 * wp.pi * lights.ambient[world, light], n)
-            unit, strength, lit, cosine = delta_light(world, light, entity, p, n, geometry, poses, casts, lights, far)
+            unit, strength, lit, cosine = delta_light(world, light, entity, p, n, geometry, poses, opacity, lights, far)
             moment += wp.outer((wp.pi * strength * lit * cosine) * lights.diffuse[world, light], unit)
         gloss.moment[world, place] = moment
 
@@ -326,6 +326,6 @@ def shade_gloss(
     inputs = [proxies, scene.geometry, scene.poses, occlusion.table, lighting.table, state.table]
     launch(kit.shade_moments, shape, inputs, [irradiance], device)
     if delta.table.kind.shape[1] > 0:
-        casts = occlusion.table.occluders.casts
-        inputs = [proxies, scene.geometry, scene.poses, casts, delta.table, delta.far, state.table]
+        opacity = occlusion.table.occluders.opacity
+        inputs = [proxies, scene.geometry, scene.poses, opacity, delta.table, delta.far, state.table]
         launch(kit.add_delta_moments, shape, inputs, [], device)

@@ -72,15 +72,16 @@ def make_occlude(order: int) -> SimpleNamespace:
     def matters(
         entity: int, own: int, p: wp.vec3, n: wp.vec3, center: wp.vec3, radius: float, rotation: wp.mat33, o: Occlusion
     ) -> float:
-        """How far an entity can take light from a receiver at p with normal n: 0 not at all, 1 fully."""
-        if entity == own or not o.occluders.casts[entity]:
+        """How far an entity can take light from a receiver at p with normal n: 0 not at all, its opacity fully."""
+        opacity = o.occluders.opacity[entity]
+        if entity == own or opacity <= 0.0:
             return 0.0
         offset = center - p
         height = wp.dot(n, offset)
         if height < -radius:
             return 0.0
         share = radius * radius / wp.max(wp.dot(offset, offset), 1.0e-12)
-        size = wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
+        size = opacity * wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
         if o.occluders.shape[entity] == wp.static(SLAB_SHAPE):
             half = o.occluders.slab_half[entity]
             n_slab = wp.transpose(rotation * o.occluders.slab_rotation[entity]) * n
@@ -214,7 +215,6 @@ class OcclusionState:
 def upload_occlusion(
     scene: Scene,
     fields: list[ShadowField | None],
-    casts: list[bool],
     order: int,
     worlds: int,
     device: wp.Device,
@@ -222,7 +222,6 @@ def upload_occlusion(
     """The occlusion tables of a scene.
 
     fields: per entity its field, or None where its coverage has a closed form. Entities may share a field.
-    casts: per entity whether it casts shadows.
     """
     kit = make_occlude(order)
     distinct = list({id(field): field for field in fields if field is not None}.values())
@@ -231,7 +230,8 @@ def upload_occlusion(
     occluders = kit.OccluderTable()
     shape = [_shape_of(mesh, field) for mesh, field in zip(shapes, fields, strict=True)]
     occluders.shape = wp.array(shape, dtype=wp.int32, device=device)
-    occluders.casts = wp.array(casts, dtype=wp.bool, device=device)
+    opacity = [entity.opacity if entity.casts else 0.0 for entity in scene.entities]
+    occluders.opacity = wp.array(opacity, dtype=wp.float32, device=device)
     occluders.field = wp.array([number.get(id(field), -1) for field in fields], dtype=wp.int32, device=device)
     slabs = [mesh.slab or (np.zeros(3), np.eye(3), np.ones(3)) for mesh in shapes]
     occluders.slab_center = wp.array(np.array([slab[0] for slab in slabs]), dtype=wp.vec3, device=device)

@@ -45,7 +45,7 @@ class PatchTable:
     center: wp.array(dtype=wp.vec3)  # (entity): of a slab in the entity's frame
     rotation: wp.array(dtype=wp.mat33)  # (entity): entity_from_slab
     slab_half: wp.array(dtype=wp.vec3)  # (entity): half extents, metres
-    casts: wp.array(dtype=wp.bool)  # (entity): False for lights
+    opacity: wp.array(dtype=wp.float32)  # (entity): 0 for lights and for what casts no shadow
     first_face: wp.array(dtype=wp.int32)  # (entity): its first of six faces, -1 for what is not a slab
     entity: wp.array(dtype=wp.int32)  # (face)
     axis: wp.array(dtype=wp.int32)  # (face): the axis of the slab that it faces along
@@ -133,8 +133,8 @@ def uncovered_part(world: int, face: int, geometry: GeometryTable, poses: PoseTa
     lower = -half
     upper = wp.vec3(half[0], half[1], half[2])
     height = patches.side[face] * half[2]
-    for entity in range(patches.casts.shape[0]):
-        if patches.casts[entity] and entity != own and patches.first_face[entity] >= 0:
+    for entity in range(patches.opacity.shape[0]):
+        if patches.opacity[entity] == 1.0 and entity != own and patches.first_face[entity] >= 0:
             turned = to_slab * wp.transpose(slab_from_world(world, entity, poses, patches))
             size = patches.slab_half[entity]
             middle = to_slab * (slab_origin(world, entity, poses, patches) - origin)
@@ -202,8 +202,8 @@ def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches:
     mean = wp.vec2()
     squares = wp.vec2()
     seen = int(0)
-    for entity in range(patches.casts.shape[0]):
-        if patches.casts[entity] and entity != own:
+    for entity in range(patches.opacity.shape[0]):
+        if patches.opacity[entity] > 0.0 and entity != own:
             position = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
             p = to_slab * (position - origin)
             rise = reach_along(n_world, world, entity, geometry, poses, patches)
@@ -330,7 +330,7 @@ def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState
     occluders = occlusion.table.occluders
     table = PatchTable()
     table.center, table.rotation = occluders.slab_center, occluders.slab_rotation
-    table.slab_half, table.casts = occluders.slab_half, occluders.casts
+    table.slab_half, table.opacity = occluders.slab_half, occluders.opacity
     chosen = [entity for entity, flat in enumerate(is_patch) if flat]
     halves = {entity: np.asarray(_slab_half(scene, entity), np.float64) for entity in chosen}
     limits = _share_texels(halves)

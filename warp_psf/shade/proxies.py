@@ -95,7 +95,7 @@ def upload_bounces(
     patches = upload_patches(scene, is_patch, occlusion, worlds, device)
     slots = total + patches.texels
     kept = _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device)
-    glossy = [entity for entity in chosen if scene.entities[entity].material.specular.max() > LEAST_LOBE]
+    glossy = [entity for entity in chosen if scene.entities[entity].lobe.specular.max() > LEAST_LOBE]
     gloss = _make_gloss(scene, glossy, kept, slots, starts, counts, field_of, fields, (order, functions), device)
     turns = np.ones(slots, np.int32)
     turns[gloss.table.proxy.numpy()] = 0
@@ -124,6 +124,7 @@ def upload_bounces(
         make_summed([int(field) for field in field_of], fields, order, functions, worlds, device),
         *_upload_own(radiating, functions, worlds, device),
         upload(np.repeat(turns[None], worlds, axis=0), wp.int32),
+        wp.full((worlds, slots), wp.vec3(1.0), dtype=wp.vec3, device=device),
         tuple(wp.zeros((worlds, slots), dtype=wp.vec3, device=device) for _ in range(2)),
         wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
         wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
@@ -207,7 +208,7 @@ def _make_gloss(
     table = kit.GlossTable()
     table.row, table.entity, table.proxy, table.place = upload(row), upload(glossy), upload(proxy), upload(place)
     table.first_place = upload(place[starts[glossy]])
-    factors = [factor_lobe(scene.entities[entity].material.exponent) for entity in glossy]
+    factors = [factor_lobe(scene.entities[entity].lobe.exponent) for entity in glossy]
     table.factors = wp.array(np.array(factors, np.float32).reshape(-1, 4), dtype=wp.vec4, device=device)
     lit = stations if glossy else 0
     table.first, table.extra = room(kit.moments.first, lit, places), room(wp.vec3, lit)

@@ -28,6 +28,7 @@ class VertexReceivers:
 
     table: VertexTable
     receivers: ReceiverTable
+    turns: wp.array  # int32 (world, vertex): 1, as all vertices are shaded in one turn
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -117,7 +118,8 @@ def upload_vertices(scene: Scene, worlds: int, device: wp.Device) -> VertexRecei
     table.face = wp.array(np.concatenate([*faces, np.zeros(0, np.int32)]), dtype=wp.int32, device=device)
     table.corner = wp.array(np.concatenate([*corners, np.zeros(0, np.int32)]), dtype=wp.int32, device=device)
     table.needed = wp.zeros((worlds, total), dtype=wp.int32, device=device)
-    return VertexReceivers(table, make_receivers((worlds, total), device))
+    turns = wp.full((worlds, total), 1, dtype=wp.int32, device=device)
+    return VertexReceivers(table, make_receivers((worlds, total), device), turns)
 
 
 def place_vertices(vertices: VertexReceivers, pixels: ReceiverTable, scene: DeviceScene, device: wp.Device) -> None:

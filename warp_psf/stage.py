@@ -1,0 +1,250 @@
+"""Everything on the device for one scene, and the stages of a frame over it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from warp_psf.bake import bake_radiance_field
+from warp_psf.bake.bodies import bake_bodies, bake_light
+from warp_psf.bake.kept import BakedBody
+from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
+from warp_psf.film.resolve import Film, make_film, resolve_pixels
+from warp_psf.scene.camera import Camera
+from warp_psf.scene.detail import refine_flat_bodies
+from warp_psf.scene.environment import Environment
+from warp_psf.scene.geometry import DeviceScene, upload_scene, write_poses
+from warp_psf.scene.light import DeltaLight, area_light_entities
+from warp_psf.scene.scene import Poses, Scene
+from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
+from warp_psf.shade.delta import DeltaState, add_delta_lights, make_delta_lights, write_delta_lights
+from warp_psf.shade.direct import DirectState, shade_direct, upload_lighting, write_environment
+from warp_psf.shade.gloss import shade_gloss
+from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
+from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice, refine_lattice
+from warp_psf.shade.occlude import OcclusionState, turn_occlusion, upload_occlusion
+from warp_psf.shade.proxies import upload_bounces
+from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
+
+Progress = Callable[[str, float], None]
+Received = tuple[wp.array, wp.array]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a stage is set up for; see `Renderer` for the meaning of each.
+
+    reach: how far shadow rays towards directional lights go, metres.
+    """
+
+    height: int
+    width: int
+    order: int
+    shading: str
+    bounces: int
+    bounce_threshold: float
+    basis_functions: int
+    antialias: bool
+    reach: float
+    device: wp.Device
+
+
+@dataclass
+class Stage:
+    """A scene on the device, with room for a frame of it.
+
+    received, bounced: irradiance and Phong radiance at the surfaces' receivers, direct and after bounces.
+    field_bytes: what is baked and kept, bytes: `occlusion` fields, `transfer`, basis `radiance` fields.
+    seconds: how long each stage of the last frame took.
+    """
+
+    settings: Settings
+    scene: Scene
+    device_scene: DeviceScene
+    occlusion: OcclusionState
+    lighting: DirectState
+    delta_lights: DeltaState
+    surfaces: Surfaces
+    film: Film
+    lattice: Lattice
+    received: Received
+    bounced: Received
+    vertices: VertexReceivers | None
+    vertices_received: Received | None
+    bounces: BounceState | None
+    last_gather: LastGather | None
+    field_bytes: dict[str, int]
+    has_moved: bool = True
+    poses: Poses | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def set_stage(scene: Scene, environment: Environment | None, settings: Settings, progress: Progress) -> Stage:
+    """Bakes what a scene needs, or reads it from the cache, and puts it on the device.
+
+    progress: called as progress(what, share) while something is baked.
+    """
+    if settings.shading == "vertex":
+        scene = refine_flat_bodies(scene)
+    device, order = settings.device, settings.order
+    casts = [entity.casts for entity in scene.entities]
+    bodies = bake_bodies(scene, casts, order, str(device), progress)
+    area_lights = area_light_entities(scene)
+    fields = [bodies[entity.mesh].field for entity in scene.entities]
+    for light, entity in area_lights:
+        fields[entity] = None
+        if light.mesh.slab is None and light.mesh.sphere is None:
+            radiance = np.ones(len(light.mesh.faces), np.float32)
+            fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
+    device_scene = upload_scene(scene, 1, device)
+    occlusion = upload_occlusion(scene, fields, order, 1, device)
+    transfers = _transfers(bodies)
+    shining = [(entity, light.radiance) for light, entity in area_lights]
+    lighting = upload_lighting(scene, transfers, shining, order, 1, device)
+    background = np.zeros((1, 1, 3), np.float32)
+    if environment is not None:
+        write_environment(lighting, environment.project(order))
+        background = environment.radiance
+
+    size = settings.width, settings.height
+    surfaces = make_surfaces(1, *size, len(scene.entities), settings.antialias, device)
+    vertices = upload_vertices(scene, 1, device) if settings.shading == "vertex" else None
+    stored = {id(baked): baked.nbytes for baked in fields if baked is not None}
+    field_bytes = {
+        "occlusion": sum(stored.values()),
+        "transfer": sum(pair[0].nbytes + pair[1].nbytes for pair in transfers if pair is not None),
+        "radiance": 0,
+    }
+    bounces = last_gather = None
+    if settings.bounces:
+        functions = settings.basis_functions
+        radiating, flat = bake_light(scene, casts, order, functions, str(device), progress)
+        bounces = upload_bounces(scene, radiating, flat, occlusion, functions, 1, device)
+        last_gather = make_last_gather(bounces, settings.bounce_threshold, *size, surfaces.slots, device)
+        field_bytes["radiance"] = sum({id(b): b.field.nbytes for _, b in filter(None, radiating)}.values())
+    return Stage(
+        settings=settings,
+        scene=scene,
+        device_scene=device_scene,
+        occlusion=occlusion,
+        lighting=lighting,
+        delta_lights=make_delta_lights(scene, 1, settings.reach, device),
+        surfaces=surfaces,
+        film=make_film(1, *size, background, device),
+        lattice=make_lattice(1, surfaces.slots, *size, device),
+        received=make_received(surfaces.slots, device),
+        bounced=make_received(surfaces.slots, device),
+        vertices=vertices,
+        vertices_received=None if vertices is None else make_received(vertices.receivers.entity.shape[1], device),
+        bounces=bounces,
+        last_gather=last_gather,
+        field_bytes=field_bytes,
+    )
+
+
+def place(stage: Stage, poses: Poses, view: Camera, lights: tuple[DeltaLight, ...]) -> None:
+    """Brings the state of a frame to the device: poses go up, nothing else does."""
+    stage.has_moved = stage.has_moved or not _same_poses(poses, stage.poses)
+    stage.poses = poses
+    write_poses(stage.device_scene, poses)
+    aim(stage.surfaces, [view])
+    stage.lighting.table.eye.assign(np.array([view.position], np.float32))
+    write_delta_lights(stage.delta_lights, [lights])
+
+
+def draw(stage: Stage) -> None:
+    """Computes the layers of the frame whose state `place` has brought."""
+    stage.seconds = {}
+    scene, device, surfaces = stage.device_scene, stage.settings.device, stage.surfaces
+    with _timed(stage, "primary visibility"):
+        find_surfaces(scene, surfaces, device)
+    with _timed(stage, "turn fields"):
+        turn_occlusion(stage.occlusion, scene, device)
+    if stage.vertices is None or stage.vertices_received is None:
+        _shade_pixels(stage)
+    else:
+        _shade_vertices(stage, stage.vertices, stage.vertices_received)
+    with _timed(stage, "shadow rays"):
+        opacity, eye = stage.occlusion.table.occluders.opacity, stage.lighting.table.eye
+        add_delta_lights(surfaces.receivers, scene, opacity, eye, stage.delta_lights, *stage.received, device)
+    if stage.bounces is not None and stage.last_gather is not None:
+        _bounce(stage, stage.bounces, stage.last_gather)
+    with _timed(stage, "resolve pixels"):
+        resolve_pixels(stage.film, surfaces, scene, stage.received, stage.bounced, device)
+
+
+def _shade_pixels(stage: Stage) -> None:
+    scene, device, pixels = stage.device_scene, stage.settings.device, stage.surfaces.receivers
+    lattice, lights = stage.lattice, (stage.occlusion, stage.lighting)
+    with _timed(stage, "shadow fields"):
+        begin_lattice(lattice, pixels, stage.surfaces.extra, device)
+        for turn in range(1, len(STRIDES) + 1):
+            shade_direct(pixels, lattice.turns, turn, scene, *lights, *stage.received, device)
+            if turn < len(STRIDES):
+                refine_lattice(lattice, turn, pixels, *stage.received, device)
+
+
+def _shade_vertices(stage: Stage, vertices: VertexReceivers, received: Received) -> None:
+    scene, device, pixels = stage.device_scene, stage.settings.device, stage.surfaces.receivers
+    with _timed(stage, "place vertices"):
+        place_vertices(vertices, pixels, scene, device)
+    with _timed(stage, "shadow fields"):
+        lights = (stage.occlusion, stage.lighting)
+        shade_direct(vertices.receivers, vertices.turns, 1, scene, *lights, *received, device)
+    with _timed(stage, "interpolate vertices"):
+        interpolate_vertices(vertices, pixels, scene, received, *stage.received, device)
+    # Every pixel receives bounced light by itself.
+    stage.lattice.turns.fill_(1)
+
+
+def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None:
+    settings, scene, lights = stage.settings, stage.device_scene, (stage.occlusion, stage.lighting)
+    device = settings.device
+    if stage.has_moved:
+        with _timed(stage, "basis irradiances"):
+            gather_basis_irradiances(bounces, scene, *lights, settings.bounce_threshold, device)
+        stage.has_moved = False
+    with _timed(stage, "light on proxies"):
+        shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, *bounces.received, device)
+        shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, stage.delta_lights, bounces.received[0], device)
+        opacity, eye = stage.occlusion.table.occluders.opacity, stage.lighting.table.eye
+        add_delta_lights(bounces.proxies, scene, opacity, eye, stage.delta_lights, *bounces.received, device)
+    with _timed(stage, "bounces"):
+        bounce(bounces, scene, stage.occlusion, settings.bounces, device)
+    with _timed(stage, "last gather"):
+        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS)
+        shown = (stage.lattice, stage.received[0], stage.bounced)
+        gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
+
+
+@contextmanager
+def _timed(stage: Stage, name: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    wp.synchronize_device(stage.settings.device)
+    stage.seconds[name] = time.perf_counter() - start
+
+
+def _transfers(bodies: list[BakedBody]) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """Of each mesh what its vertices see of the world past itself, and of themselves; None for convex ones."""
+    return [
+        None if body.transfer is None or body.visibility is None else (body.transfer, body.visibility)
+        for body in bodies
+    ]
+
+
+def make_received(count: int, device: wp.Device) -> Received:
+    """Irradiance and Phong radiance of `count` receivers."""
+    return (
+        wp.zeros((1, count), dtype=wp.vec3, device=device),
+        wp.zeros((1, count), dtype=wp.vec3, device=device),
+    )
+
+
+def _same_poses(a: Poses, b: Poses | None) -> bool:
+    return b is not None and np.array_equal(a.position, b.position) and np.array_equal(a.rotation, b.rotation)
