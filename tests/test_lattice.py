@@ -7,8 +7,8 @@ import warp as wp
 import warp_psf as psf
 from tests.oracles import make_renderer
 from warp_psf.shade import lattice
-from warp_psf.stage import make_received
 from warp_psf.shade.direct import shade_direct
+from warp_psf.stage import make_received
 
 HEIGHT, WIDTH = 215, 381  # not multiples of the strides
 SCENE = (
