@@ -5,104 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
-import warp_psf
+from tests.flat_renderer import MODEL, SMALL, FlatRenderer, assert_refused, files_of, model_path, renderers, run
 from warp_psf import cli
+from warp_psf.cli.fingerprint import fingerprint
 from warp_psf.film.writer import read_exr, write_exr, write_png
 
-MODEL = """
-<mujoco>
-  <worldbody>
-    <light pos="0 0 3"/>
-    <camera name="front" pos="0 -3 1" xyaxes="1 0 0 0 0.3 1"/>
-    <geom name="floor" type="plane" size="2 2 0.1"/>
-    <body pos="0 0 1"><freejoint/><geom name="ball" size="0.2"/></body>
-  </worldbody>
-</mujoco>
-"""
-SMALL = ("--size", "32x18", "--fps", "10", "--duration", "0.4", "--camera", "front")
-
-
-class FlatRenderer:
-    """Stands in for `warp_psf.Renderer`: the brightness of a picture is the height of the model's last body."""
-
-    made: list[FlatRenderer]
-    stop_after: int | None  # pictures until Ctrl-C
-
-    def __init__(self, model, height: int, width: int, *, progress, **options):
-        if options["environment"] == "nowhere":
-            raise ValueError("environment 'nowhere' is neither built in nor a file")
-        progress("baking ball", 0.5)
-        progress("baking ball", 1.0)
-        self.model, self.height, self.width, self.options = model, height, width, options
-        self.world_from_camera = np.eye(4)
-        self.pictures = 0
-        self.made.append(self)
-
-    def __enter__(self) -> FlatRenderer:
-        return self
-
-    def __exit__(self, *_) -> None:
-        pass
-
-    def update_scene(self, data, camera=-1) -> None:
-        if camera != -1 and mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, camera) < 0:
-            raise ValueError(f"the model has no camera {camera!r}")
-        self.level = float(data.xpos[-1, 2])
-
-    def render(self) -> np.ndarray:
-        if self.pictures == self.stop_after:
-            raise KeyboardInterrupt
-        self.pictures += 1
-        return np.full((self.height, self.width, 3), round(200 * self.level), np.uint8)
-
-    def layers(self) -> dict[str, np.ndarray]:
-        shape = (self.height, self.width)
-        color = np.full((*shape, 3), self.level, np.float32)
-        layers = dict.fromkeys(("color", "direct", "albedo", "normal"), color) | {"indirect": color / 4}
-        return layers | {"depth": np.ones(shape, np.float32), "segmentation": np.zeros((*shape, 2), np.int32)}
-
-
-@pytest.fixture
-def renderers(monkeypatch) -> Iterator[list[FlatRenderer]]:
-    """The renderers that commands make from here on."""
-    FlatRenderer.made = []
-    FlatRenderer.stop_after = None
-    monkeypatch.setattr(warp_psf, "Renderer", FlatRenderer, raising=False)
-    yield FlatRenderer.made
-
-
-@pytest.fixture
-def model_path(tmp_path) -> Path:
-    path = tmp_path / "fall.xml"
-    path.write_text(MODEL)
-    return path
-
-
-def run(*arguments) -> Result:
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-def assert_refused(result: Result, *words: str, status: int = 2) -> None:
-    """One sentence on stderr that holds the words, and nothing else."""
-    lines = result.stderr.strip().splitlines()
-    sentence = lines[-1]
-    assert result.exit_code == status, result.output
-    assert sentence.startswith("warp-psf: ")
-    assert not any("Traceback" in line for line in lines)
-    for word in words:
-        assert word in sentence
+__all__ = ["model_path", "renderers"]
 
 
 def test_render_writes_every_frame_and_what_is_made_of_them(renderers, model_path, tmp_path):
@@ -252,14 +165,14 @@ def test_a_simulation_that_ends_early_says_so(renderers, tmp_path, monkeypatch, 
 
 def test_fingerprint_sees_any_number_of_a_model():
     model, twin = (mujoco.MjModel.from_xml_string(MODEL) for _ in range(2))
-    assert cli.fingerprint(model) == cli.fingerprint(twin)
-    seen = {cli.fingerprint(twin)}
+    assert fingerprint(model) == fingerprint(twin)
+    seen = {fingerprint(twin)}
     twin.geom_size[1, 0] += 1e-9
-    seen.add(cli.fingerprint(twin))
+    seen.add(fingerprint(twin))
     twin.opt.timestep *= 2
-    seen.add(cli.fingerprint(twin))
+    seen.add(fingerprint(twin))
     twin.vis.headlight.ambient[0] += 0.5
-    seen.add(cli.fingerprint(twin))
+    seen.add(fingerprint(twin))
     assert len(seen) == 4
 
 
@@ -310,31 +223,6 @@ def test_info_names_versions_and_the_cache(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     for word in ("Python", "warp-lang", "mujoco", "cpu", "cores", str(tmp_path / "cache"), "0 files"):
         assert word in result.stdout
-
-
-def test_bake_leaves_nothing_for_the_renderer_to_bake(model_path, tmp_path, monkeypatch):
-    monkeypatch.setenv("WARP_PSF_CACHE", str(tmp_path / "cache"))
-    result = run("bake", model_path)
-    assert result.exit_code == 0, result.output
-    assert "adaptive saving" in result.stdout
-    lines = [line.strip("│").split("│") for line in result.stdout.splitlines() if line.startswith("│")]
-    rows = {name.strip(): [cell.strip() for cell in cells] for name, *cells in lines}
-    assert rows["plane"][2] == rows["sphere"][2] == "closed form"
-    # While rendering, the light of the floor is kept in textures, and that of the ball on shells around it.
-    assert rows["plane"][-1] == "textures"
-    light_bytes = int(rows["sphere"][-1].replace(",", ""))
-
-    shares = []
-    model = mujoco.MjModel.from_xml_path(str(model_path))
-    with warp_psf.Renderer(model, 18, 32, progress=lambda what, share: shares.append(share)) as renderer:
-        assert renderer.field_bytes["radiance"] == light_bytes > 0
-    # What is read from the cache is finished when it is first reported.
-    assert set(shares) == {1.0}
-
-
-def test_bake_names_a_mesh_that_is_not_there(tmp_path):
-    assert_refused(run("bake", tmp_path / "absent.obj"), "absent.obj")
-    assert_refused(run("bake", tmp_path / "absent.obj", "--device", "cuda:99"), "cuda:99")
 
 
 def test_warnings_are_one_line(tmp_path, monkeypatch):
