@@ -45,7 +45,7 @@ ALL_GEOMS = f"""
       <geom name="can" type="cylinder" size=".1 .4" pos="1 1 0"/>
       <geom name="egg" type="ellipsoid" size=".1 .2 .4" pos="1 1 1"/>
       <geom name="first" type="mesh" mesh="tetra" pos="2 0 0"/>
-      <geom name="second" type="mesh" mesh="tetra" pos="3 0 0"/>
+      <geom name="second" type="mesh" mesh="tetra" pos="6 0 0"/>
     </body>
   </worldbody>
 </mujoco>
@@ -134,7 +134,7 @@ def test_meshes_lie_where_mujoco_puts_them(model, data, scene):
     vertices = scene.meshes[scene.entities[index].mesh].vertices
     world = vertices @ poses.rotation[0, index].T + poses.position[0, index]
     body = data.body("moving")
-    local = (world - body.xpos) @ body.xmat.reshape(3, 3) - [3.0, 0.0, 0.0]
+    local = (world - body.xpos) @ body.xmat.reshape(3, 3) - [6.0, 0.0, 0.0]
     corners = np.unique(np.round(local, 5) + 0.0, axis=0)
     np.testing.assert_allclose(
         corners, np.unique(np.array(TETRAHEDRON.split(), float).reshape(-1, 3), axis=0), atol=2e-5
@@ -210,6 +210,26 @@ def test_area_lights_are_the_last_entities(model, data):
     body = data.body("moving")
     np.testing.assert_allclose(poses.position[0, -2], body.xpos + body.xmat.reshape(3, 3) @ [0.0, 0.1, 0.2], atol=1e-6)
     np.testing.assert_allclose(poses.rotation[0, -2].ravel(), body.xmat, atol=1e-6)
+
+
+def test_infinite_planes_follow_the_camera():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><statistic extent="1"/><asset><texture name="t" type="2d" builtin="checker" width="8" height="8"/>'
+        '<material name="m" texture="t" texrepeat="3 3"/></asset><worldbody><geom size="1"/>'
+        '<geom name="endless" type="plane" size="0 2 1" euler="0 0 90" material="m"/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene = bridge.build_scene(model)
+    for distance in (0.0, 3.0, 70.0, -1000.0, 12345.0):
+        eye = np.array((50.0, distance, 1.0))  # the plane's own x axis is the world's y
+        plane = bridge.read_poses(model, data, scene, eye).position[0, 1]
+        half = INFINITE_PLANE * model.stat.extent
+        assert abs(plane[1] - distance) < 0.25 * half
+        assert (plane[0], plane[2]) == pytest.approx((0.0, 0.0), abs=1e-3)
+        # Whole repetitions of the texture; far out float32 has centimetres left.
+        assert abs(plane[1] / (4 / 3) - round(plane[1] / (4 / 3))) < 1e-3
+    np.testing.assert_array_equal(bridge.read_poses(model, data, scene).position[0, 1], 0.0)
 
 
 # Lights
@@ -316,11 +336,6 @@ def test_tracking_and_moved_free_camera(model, data):
 def test_camera_with_a_sensor():
     model, data = simple('<camera name="c" sensorsize=".02 .01" focal=".03 .03" resolution="200 100"/>')
     assert bridge.read_camera(model, data, "c").fovy == pytest.approx(2.0 * np.arctan(0.5 * 0.01 / 0.03), rel=1e-6)
-    model, data = simple(
-        '<camera name="c" sensorsize=".02 .01" focal=".03 .03" principal=".002 0" resolution="200 100"/>'
-    )
-    with pytest.warns(UserWarning, match="camera c: its shifted image is drawn centred"):
-        bridge.read_camera(model, data, "c")
 
 
 def test_cameras_that_are_not_there(model, data):
@@ -336,14 +351,6 @@ def test_cameras_that_are_not_there(model, data):
     for camera, message in ((user, "mjCAMERA_USER"), (tracking, "tracks body 99"), (fixed, "camera 99 does not")):
         with pytest.raises(ValueError, match=message):
             bridge.read_camera(model, data, camera)
-
-
-def test_orthographic_camera():
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><visual><global orthographic="true"/></visual><worldbody><geom size="1"/></worldbody></mujoco>'
-    )
-    with pytest.raises(ValueError, match="camera free is orthographic"):
-        bridge.read_camera(model, mujoco.MjData(model))
 
 
 # Errors

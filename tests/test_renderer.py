@@ -97,12 +97,14 @@ def test_out_receives_the_picture(scene):
     out = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     assert renderer.render(out=out) is out
     np.testing.assert_array_equal(out, renderer.render())
+    other = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    assert renderer.render(out=other) is other
+    np.testing.assert_array_equal(out, other)
 
 
-@pytest.mark.parametrize("out", [np.zeros((HEIGHT, WIDTH), np.uint8), np.zeros((HEIGHT, WIDTH, 3), np.float32)])
-def test_wrong_out(scene, out):
-    with pytest.raises(ValueError, match=rf"out is {out.dtype} .* the picture uint8 \({HEIGHT}, {WIDTH}, 3\)"):
-        scene[0].render(out=out)
+def test_wrong_out(scene):
+    with pytest.raises(ValueError, match=rf"shape \({HEIGHT}, {WIDTH}\), the picture \({HEIGHT}, {WIDTH}, 3\)"):
+        scene[0].render(out=np.zeros((HEIGHT, WIDTH), np.uint8))
 
 
 def test_nothing_to_render_yet():

@@ -10,14 +10,24 @@ from typing import NoReturn
 import mujoco
 import numpy as np
 
-from warp_psf.bridge import build_scene, looks, read_camera, read_delta_lights, read_poses
+from warp_psf.bridge import (
+    build_scene,
+    find_camera,
+    looks,
+    read_camera,
+    read_delta_lights,
+    read_loose,
+    read_poses,
+)
 from warp_psf.device import find_device
 from warp_psf.field.radiance import FUNCTION_COUNTS
 from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
 from warp_psf.film.resolve import read_layers
 from warp_psf.scene.environment import Environment, load_environment
+from warp_psf.scene.geometry import write_loose
 from warp_psf.scene.light import Light
-from warp_psf.stage import Progress, Settings, Stage, draw, place, set_stage
+from warp_psf.scene.loose import LooseRoom, make_room
+from warp_psf.stage import Progress, Settings, Stage, draw, place, set_stage, take_over
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
@@ -38,6 +48,7 @@ class Renderer:
 
     model: the compiled model; edges are antialiased unless its `visual/quality` says offsamples below 2. height, width:
         of the picture, pixels.
+    max_geom: how many geoms `scene` has room for.
     environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
         HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
     lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
@@ -65,6 +76,7 @@ class Renderer:
         model: mujoco.MjModel,
         height: int = 240,
         width: int = 320,
+        max_geom: int = 10000,
         *,
         environment: str | np.ndarray | Environment | None = "studio",
         lights: Sequence[Light] = (),
@@ -101,11 +113,13 @@ class Renderer:
         self._material_space, self._lights, self._model_lights = material_space, lights, model_lights
         self._progress = progress or (lambda what, share: None)
         self._option = mujoco.MjvOption()
+        self._scene = mujoco.MjvScene(model, max_geom)
+        self._shown = 0
         self._looks = looks(model, self._option)
-        self._standing: Stage | None = self._set_stage(self._option)
+        self._standing: Stage | None = self._set_stage(self._option, self._first_room())
         self._depth_rendering = self._segmentation_rendering = False
         self._world_from_camera: np.ndarray | None = None
-        self._drawn = False
+        self._drawn, self._drawn_geoms = False, 0
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -121,6 +135,15 @@ class Renderer:
     def width(self) -> int:
         """Columns of the picture."""
         return self._settings.width
+
+    @property
+    def scene(self) -> mujoco.MjvScene:
+        """MuJoCo's abstract scene of the last `update_scene`.
+
+        Geoms that a script adds to it (mjv_initGeom and ngeom + 1, mjv_connector) are drawn by the next `render`, as
+        marks that cast no shadows; other changes of it change nothing.
+        """
+        return self._scene
 
     @property
     def world_from_camera(self) -> np.ndarray:
@@ -170,9 +193,10 @@ class Renderer:
         option = self._option if scene_option is None else scene_option
         now = looks(self._model, option)
         if now != self._looks:
-            self._standing = self._set_stage(option)
+            self._standing = self._set_stage(option, stage.room)
             self._looks, stage = now, self._stage
-        poses = read_poses(self._model, data, stage.scene)
+        poses = read_poses(self._model, data, stage.scene, view.position)
+        self._read_scene(data, option, find_camera(self._model, camera))
         place(stage, poses, view, read_delta_lights(self._model, data, stage.scene, view))
         self._world_from_camera = np.eye(4)
         self._world_from_camera[:3, :3], self._world_from_camera[:3, 3] = view.rotation, view.position
@@ -182,11 +206,12 @@ class Renderer:
         """The picture of the last `update_scene`.
 
         Returns uint8 [height, width, 3], ready to be shown; with depth rendering on, float32 [height, width], metres;
-        with segmentation rendering on, int32 [height, width, 2], object ids and types. `out` receives it if given.
+        with segmentation rendering on, int32 [height, width, 2], object ids and types. `out` receives it if given, cast
+        to its type as MuJoCo's renderer does.
 
         Raises:
             RuntimeError: `update_scene` was not called, or the renderer is closed.
-            ValueError: `out` has another shape or type.
+            ValueError: `out` has another shape.
         """
         stage = self._draw()
         if self._depth_rendering:
@@ -202,11 +227,9 @@ class Renderer:
             stage.seconds["display"] = time.perf_counter() - start
         if out is None:
             return picture
-        if out.shape != picture.shape or out.dtype != picture.dtype:
-            raise ValueError(
-                f"out is {out.dtype} {out.shape}, the picture {picture.dtype} {picture.shape}; give an array like it"
-            )
-        np.copyto(out, picture)
+        if out.shape != picture.shape:
+            raise ValueError(f"out has the shape {out.shape}, the picture {picture.shape}; give an array of its shape")
+        np.copyto(out, picture, casting="unsafe")
         return out
 
     def layers(self) -> dict[str, np.ndarray]:
@@ -254,25 +277,61 @@ class Renderer:
             raise RuntimeError("the renderer is closed; make a new one")
         return self._standing
 
-    def _set_stage(self, option: mujoco.MjvOption) -> Stage:
+    def _set_stage(self, option: mujoco.MjvOption, room: LooseRoom | None) -> Stage:
         scene = build_scene(
             self._model,
             option=option,
             material_space=self._material_space,
             lights=self._lights,
             model_lights=self._model_lights,
+            loose=room,
         )
-        return set_stage(scene, self._environment, self._settings, self._progress)
+        return set_stage(scene, self._environment, self._settings, room, self._progress)
 
     def _draw(self) -> Stage:
         """The stage with the layers of the present state."""
         stage = self._stage
         if self._world_from_camera is None:
             raise RuntimeError("there is nothing to render yet; call update_scene(data, camera) first")
-        if not self._drawn:
+        if not self._drawn or self._scene.ngeom != self._drawn_geoms:
+            stage = self._bring_loose(stage)
             draw(stage)
-            self._drawn = True
+            self._drawn, self._drawn_geoms = True, self._scene.ngeom
         return stage
+
+    def _bring_loose(self, stage: Stage) -> Stage:
+        """Brings tendons, skins, flexes and added geoms to the stage, or to a larger one where they need more room."""
+        rigid = sum(len(entity.parts) for entity in stage.scene.entities if entity.parts[0].object_id >= 0)
+        loose = None
+        if self._scene.ngeom > rigid:
+            loose = read_loose(self._model, self._scene, self._shown, self._material_space, self._metres_per_pixel())
+        if loose is not None and (stage.room is None or not stage.room.holds(loose)):
+            standing, self._standing = stage, self._set_stage(self._option_in_use, make_room(loose))
+            stage = self._stage
+            take_over(stage, standing)
+        if stage.room is not None:
+            write_loose(stage.device_scene, stage.scene, loose)
+        return stage
+
+    def _first_room(self) -> LooseRoom | None:
+        """Room for what the model itself has without a rigid shape, as it is at the start."""
+        if self._model.ntendon + self._model.nflex + self._model.nskin == 0:
+            return None
+        data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, data)
+        self._read_scene(data, self._option, find_camera(self._model, -1))
+        loose = read_loose(self._model, self._scene, self._shown, self._material_space, 0.0)
+        return None if loose is None else make_room(loose)
+
+    def _read_scene(self, data: mujoco.MjData, option: mujoco.MjvOption, camera: mujoco.MjvCamera) -> None:
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, option, None, camera, every, self._scene)
+        self._shown, self._option_in_use = self._scene.ngeom, option
+
+    def _metres_per_pixel(self) -> float:
+        """What a pixel of the picture spans at a distance of one metre."""
+        left = self._scene.camera[0]
+        return float((left.frustum_top - left.frustum_bottom) / left.frustum_near) / self.height
 
 
 def _check_model(model: mujoco.MjModel) -> None:

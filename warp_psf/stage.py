@@ -15,11 +15,13 @@ from warp_psf.bake.bodies import bake_bodies, bake_light
 from warp_psf.bake.kept import BakedBody
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import Film, make_film, resolve_pixels
+from warp_psf.film.tracing import any_seen_from_behind
 from warp_psf.scene.camera import Camera
 from warp_psf.scene.detail import refine_flat_bodies
 from warp_psf.scene.environment import Environment
 from warp_psf.scene.geometry import DeviceScene, upload_scene, write_poses
 from warp_psf.scene.light import DeltaLight, area_light_entities
+from warp_psf.scene.loose import LooseRoom
 from warp_psf.scene.scene import Poses, Scene
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
 from warp_psf.shade.delta import DeltaState, add_delta_lights, make_delta_lights, write_delta_lights
@@ -60,11 +62,13 @@ class Stage:
 
     received, bounced: irradiance and Phong radiance at the surfaces' receivers, direct and after bounces.
     field_bytes: what is baked and kept, bytes: `occlusion` fields, `transfer`, basis `radiance` fields.
+    room: for the scene's loose entity, None where it has none.
     seconds: how long each stage of the last frame took.
     """
 
     settings: Settings
     scene: Scene
+    room: LooseRoom | None
     device_scene: DeviceScene
     occlusion: OcclusionState
     lighting: DirectState
@@ -81,10 +85,13 @@ class Stage:
     field_bytes: dict[str, int]
     has_moved: bool = True
     poses: Poses | None = None
+    seen: tuple[Camera, tuple[DeltaLight, ...]] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def set_stage(scene: Scene, environment: Environment | None, settings: Settings, progress: Progress) -> Stage:
+def set_stage(
+    scene: Scene, environment: Environment | None, settings: Settings, room: LooseRoom | None, progress: Progress
+) -> Stage:
     """Bakes what a scene needs, or reads it from the cache, and puts it on the device.
 
     progress: called as progress(what, share) while something is baked.
@@ -112,7 +119,8 @@ def set_stage(scene: Scene, environment: Environment | None, settings: Settings,
         background = environment.radiance
 
     size = settings.width, settings.height
-    surfaces = make_surfaces(1, *size, len(scene.entities), settings.antialias, device)
+    see_through = any(entity.opacity < 1.0 for entity in scene.entities)
+    surfaces = make_surfaces(1, *size, scene, settings.antialias, see_through, device)
     vertices = upload_vertices(scene, 1, device) if settings.shading == "vertex" else None
     stored = {id(baked): baked.nbytes for baked in fields if baked is not None}
     field_bytes = {
@@ -130,6 +138,7 @@ def set_stage(scene: Scene, environment: Environment | None, settings: Settings,
     return Stage(
         settings=settings,
         scene=scene,
+        room=room,
         device_scene=device_scene,
         occlusion=occlusion,
         lighting=lighting,
@@ -150,11 +159,24 @@ def set_stage(scene: Scene, environment: Environment | None, settings: Settings,
 def place(stage: Stage, poses: Poses, view: Camera, lights: tuple[DeltaLight, ...]) -> None:
     """Brings the state of a frame to the device: poses go up, nothing else does."""
     stage.has_moved = stage.has_moved or not _same_poses(poses, stage.poses)
-    stage.poses = poses
+    stage.poses, stage.seen = poses, (view, lights)
     write_poses(stage.device_scene, poses)
+    if not stage.surfaces.see_through and any_seen_from_behind(stage.scene, poses, view):
+        _make_see_through(stage)
     aim(stage.surfaces, [view])
-    stage.lighting.table.eye.assign(np.array([view.position], np.float32))
+    stage.lighting.table.eye.assign(np.array([view.eye], np.float32))
     write_delta_lights(stage.delta_lights, [lights])
+
+
+def take_over(stage: Stage, before: Stage) -> None:
+    """Shows on a new stage the state that an older one of the same model shows, whose loose entity lacked room."""
+    poses = before.poses
+    if poses is None or before.seen is None:
+        return
+    if before.scene.loose < 0:
+        position = np.insert(poses.position, stage.scene.loose, 0.0, axis=1)
+        poses = Poses(position, np.insert(poses.rotation, stage.scene.loose, np.eye(3), axis=1))
+    place(stage, poses, *before.seen)
 
 
 def draw(stage: Stage) -> None:
@@ -220,6 +242,18 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS)
         shown = (stage.lattice, stage.received[0], stage.bounced)
         gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
+
+
+def _make_see_through(stage: Stage) -> None:
+    """Gives every pixel room for what lies behind the surface that it shows."""
+    settings, device = stage.settings, stage.settings.device
+    size = settings.width, settings.height
+    stage.surfaces = make_surfaces(1, *size, stage.scene, settings.antialias, True, device)
+    slots = stage.surfaces.slots
+    stage.lattice = make_lattice(1, slots, *size, device)
+    stage.received, stage.bounced = make_received(slots, device), make_received(slots, device)
+    if stage.bounces is not None:
+        stage.last_gather = make_last_gather(stage.bounces, settings.bounce_threshold, *size, slots, device)
 
 
 @contextmanager

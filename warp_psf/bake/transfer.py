@@ -24,8 +24,33 @@ def bake_transfer(mesh: Mesh, warp_mesh: wp.Mesh, order: int, device: wp.Device)
     """
     points = (mesh.vertices + VERTEX_OFFSET * mesh.radius * mesh.normals).astype(np.float32)
     blocked, blocked_cosine = visibility.project_blocked_hemisphere(
-        warp_mesh, points, mesh.normals, RAYS_PER_VERTEX, order, device
+        warp_mesh, points, mesh.normals, RAYS_PER_VERTEX, order, device, solid=mesh.closed
     )
     cosine = sh.zonal(sh.clamped_cosine(order), mesh.normals)
     hemisphere = sh.zonal(sh.cap(np.pi / 2, order), mesh.normals)
-    return (cosine - blocked_cosine).astype(np.float32), (hemisphere - blocked).astype(np.float32)
+    transfer, visibility_of_self = cosine - blocked_cosine, hemisphere - blocked
+    _, buried = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, mesh.closed, points, device)
+    both = np.concatenate([transfer, visibility_of_self], axis=1)
+    both = _fill_buried(mesh.faces, buried, both).astype(np.float32)
+    return both[:, : order * order], both[:, order * order :]
+
+
+def _fill_buried(faces: np.ndarray, buried: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [V, K] with those of buried vertices taken from the nearest vertices, along edges, that are not.
+
+    A vertex inside another part of the body is seen by nobody, but the faces that reach out of there are: interpolated
+    to its darkness, they would show a black seam.
+    """
+    values, known = values.copy(), ~buried
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ends = np.concatenate([ends, ends[:, ::-1]])
+    while True:
+        from_known = ends[known[ends[:, 0]] & ~known[ends[:, 1]]]
+        if len(from_known) == 0:
+            return values
+        total, count = np.zeros_like(values), np.zeros(len(values))
+        np.add.at(total, from_known[:, 1], values[from_known[:, 0]])
+        np.add.at(count, from_known[:, 1], 1.0)
+        reached = count > 0.0
+        values[reached] = total[reached] / count[reached, None]
+        known |= reached

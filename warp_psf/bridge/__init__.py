@@ -1,18 +1,21 @@
 """MuJoCo's models and data as scenes, poses, lights and cameras."""
 
-from warp_psf.bridge.cameras import read_camera
+from warp_psf.bridge.cameras import find_camera, read_camera
 from warp_psf.bridge.entities import build_scene, read_poses
 from warp_psf.bridge.lights import read_delta_lights
+from warp_psf.bridge.loose import read_loose
 from warp_psf.bridge.model import check_data, load_model, simulate
 from warp_psf.bridge.shown import looks
 
 __all__ = [
     "build_scene",
     "check_data",
+    "find_camera",
     "load_model",
     "looks",
     "read_camera",
     "read_delta_lights",
+    "read_loose",
     "read_poses",
     "simulate",
 ]

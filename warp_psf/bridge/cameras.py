@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import warnings
 
 import mujoco
 import numpy as np
@@ -11,38 +10,41 @@ import numpy as np
 from warp_psf.bridge.model import check_data, label
 from warp_psf.scene.camera import Camera
 
-# A camera whose image is shifted by more than this part of its height is warned about.
-CENTERED = 1e-4
-
 
 def read_camera(model: mujoco.MjModel, data: mujoco.MjData, camera: int | str | mujoco.MjvCamera = -1) -> Camera:
-    """The pinhole camera that `mujoco.Renderer` would use: an id, a name, -1 for the free camera, or an MjvCamera.
+    """The camera that `mujoco.Renderer` would use: an id, a name, -1 for the free camera, or an MjvCamera.
 
     Raises:
-        ValueError: there is no such camera, it is orthographic, or `data` is of another model.
+        ValueError: there is no such camera, or `data` is of another model.
     """
     check_data(model, data)
-    chosen = _find_camera(model, camera)
+    chosen = find_camera(model, camera)
     # MuJoCo itself computes the view: this object holds no more than its two cameras, and needs no OpenGL.
     view = mujoco.MjvScene()
     mujoco.mjv_updateCamera(model, data, chosen, view)
     left, right = view.camera[0], view.camera[1]
-    if left.orthographic:
-        raise ValueError(f"camera {_camera_name(model, chosen)} is orthographic; only perspective cameras are drawn")
-    height = left.frustum_top - left.frustum_bottom
-    shift = max(abs(left.frustum_top + left.frustum_bottom), abs(2.0 * left.frustum_center))
-    if shift > CENTERED * height:
-        warnings.warn(f"camera {_camera_name(model, chosen)}: its shifted image is drawn centred", stacklevel=2)
     position = 0.5 * (np.array(left.pos, dtype=np.float64) + np.array(right.pos, dtype=np.float64))
     back = -np.array(left.forward, dtype=np.float64)
     back /= np.linalg.norm(back)
     across = np.cross(np.array(left.up, dtype=np.float64), back)
     across /= np.linalg.norm(across)
     rotation = np.stack((across, np.cross(back, across), back), axis=1)
-    return Camera(position, rotation, float(2.0 * np.arctan(0.5 * height / left.frustum_near)))
+    # The frustum of a pinhole is given on the near plane, that of an orthographic camera in metres.
+    depth = 1.0 if left.orthographic else left.frustum_near
+    return Camera(
+        position,
+        rotation,
+        half_height=0.5 * (left.frustum_top - left.frustum_bottom) / depth,
+        # Half the width, whatever its name says, and 0 where the picture's shape decides.
+        half_width=left.frustum_width / depth if left.frustum_width else None,
+        center=(left.frustum_center / depth, 0.5 * (left.frustum_top + left.frustum_bottom) / depth),
+        near=float(left.frustum_near),
+        far=float(left.frustum_far),
+        orthographic=bool(left.orthographic),
+    )
 
 
-def _find_camera(model: mujoco.MjModel, camera: int | str | mujoco.MjvCamera) -> mujoco.MjvCamera:
+def find_camera(model: mujoco.MjModel, camera: int | str | mujoco.MjvCamera) -> mujoco.MjvCamera:
     """The MjvCamera that an id, a name or an MjvCamera means, checked against the model."""
     kinds = mujoco.mjtCamera
     chosen = camera
@@ -66,7 +68,3 @@ def _find_camera(model: mujoco.MjModel, camera: int | str | mujoco.MjvCamera) ->
 def _known_cameras(model: mujoco.MjModel) -> str:
     names = ", ".join(label(model, "camera", index) for index in range(model.ncam))
     return f"the model has {names}, and -1 is the free camera" if names else "the model has only -1, the free one"
-
-
-def _camera_name(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> str:
-    return label(model, "camera", camera.fixedcamid) if camera.type == mujoco.mjtCamera.mjCAMERA_FIXED else "free"

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from warp_psf.bridge.lights import body_of_light, light_kind, model_lights_of
+from warp_psf.bridge.grouping import group_geoms
+from warp_psf.bridge.lights import body_of_light, model_lights_of
 from warp_psf.bridge.look import SPACES, find_texture, make_material, read_texture
 from warp_psf.bridge.model import check_data, label
-from warp_psf.bridge.shapes import ShapeKey, geom_shape_key, make_shape, site_shape_key
+from warp_psf.bridge.shapes import ShapeKey, geom_shape_key, make_shape, plane_step, site_shape_key
 from warp_psf.bridge.shown import OPAQUE, Shown, find_shown
+from warp_psf.scene.join import join_meshes
 from warp_psf.scene.light import AreaLight, Light, area_light_entities, check_lights
+from warp_psf.scene.loose import LooseRoom, reserve
 from warp_psf.scene.material import Material
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Entity, Part, Poses, Scene
@@ -29,19 +31,21 @@ def build_scene(
     material_space: str = "srgb",
     lights: Sequence[Light] = (),
     model_lights: bool = True,
+    loose: LooseRoom | None = None,
 ) -> Scene:
     """Everything about a model that does not change from frame to frame.
 
-    Entities are the geoms that `option` shows, in the model's order, then the sites, then one for every `AreaLight`
-    (`area_light_entities` pairs them). Equal shapes share a mesh. A plane without a size becomes a square that reaches
-    beyond what the camera sees. Sites are seen and shaded, but are marks and no bodies: they take light from nothing.
-    What is not drawn yet (flexes, skins) is named in one warning.
+    Entities are the geoms that `option` shows, alone or in groups (`group_geoms`), then the sites, then one that stands
+    for all that has no rigid shape (`read_loose`), then one for every `AreaLight` (`area_light_entities` pairs them).
+    Equal shapes share a mesh. A plane without a size becomes a square that reaches beyond what the camera sees. Sites
+    and loose things are seen and shaded, but take light from nothing.
 
     Args:
         option: what is shown; MuJoCo's defaults without.
         material_space: what MJCF's rgba and textures mean: "srgb" is decoded to linear, "linear" is taken as it is.
         lights: area lights, and any others, in addition to the model's.
         model_lights: False leaves out the model's lights and its headlight.
+        loose: room for what has no rigid shape; None for none.
 
     Returns:
         The scene; its lights are the area lights of `lights` first, then the others, then the model's, headlight last.
@@ -53,31 +57,38 @@ def build_scene(
     if material_space not in SPACES:
         raise ValueError(f"material_space is {material_space!r}; choose 'srgb' or 'linear'")
     check_lights(lights, model.nlight)
-    undrawn = _undrawn(model)
-    if undrawn:
-        warnings.warn(f"not drawn, because not supported yet: {', '.join(undrawn)}", stacklevel=2)
     build = _Build(model, find_shown(model, option or mujoco.MjvOption()), material_space)
-    for geom in build.shown.geoms:
-        key = geom_shape_key(model, geom)
-        if key is not None:
-            rgba, material = build.shown.geom_rgba[geom], int(model.geom_matid[geom])
-            build.add(key, "geom", geom, rgba, material, casts=True)
+    for geoms in group_geoms(model, build.shown):
+        if len(geoms) > 1:
+            build.add_group(geoms)
+        elif (key := geom_shape_key(model, geoms[0])) is not None:
+            rgba, material = build.shown.geom_rgba[geoms[0]], int(model.geom_matid[geoms[0]])
+            build.add(key, "geom", geoms[0], rgba, material, casts=True)
     for site in build.shown.sites:
         key = site_shape_key(model, site)
         if key is not None:
             rgba, material = build.shown.site_rgba[site], int(model.site_matid[site])
             build.add(key, "site", site, rgba, material, casts=False)
+    place_of_loose = -1
+    if loose is not None:
+        place_of_loose = len(build.entities)
+        shape, entity = reserve(loose, len(build.shapes))
+        build.shapes.append(shape)
+        build.entities.append(entity)
     area = [light for light in lights if isinstance(light, AreaLight)]
     for light in area:
         body_of_light(model, light)
         build.add_light(light)
     others = [light for light in lights if not isinstance(light, AreaLight)]
     of_model = model_lights_of(model) if model_lights else []
-    return Scene(tuple(build.shapes), tuple(build.entities), (*area, *others, *of_model), tuple(build.textures))
+    lamps = (*area, *others, *of_model)
+    return Scene(tuple(build.shapes), tuple(build.entities), lamps, tuple(build.textures), place_of_loose)
 
 
-def read_poses(model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> Poses:
+def read_poses(model: mujoco.MjModel, data: mujoco.MjData, scene: Scene, eye: np.ndarray | None = None) -> Poses:
     """Where every entity of a scene is in this state, as one world: geoms, sites and area lights.
+
+    eye: the camera's position, [3], metres; infinite planes follow it. Without it they stay where the model has them.
 
     Raises:
         ValueError: `data` is of another model, or holds no finite poses.
@@ -85,17 +96,24 @@ def read_poses(model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> Pose
     check_data(model, data)
     area = area_light_entities(scene)
     objects = scene.entities[: len(scene.entities) - len(area)]
-    position = np.empty((1, len(scene.entities), 3), dtype=np.float32)
-    rotation = np.empty((1, len(scene.entities), 3, 3), dtype=np.float32)
+    position = np.zeros((1, len(scene.entities), 3), dtype=np.float32)
+    # What is loose lies in the world's frame.
+    rotation = np.tile(np.eye(3, dtype=np.float32), (1, len(scene.entities), 1, 1))
     kinds = np.array([entity.parts[0].object_type for entity in objects], np.int64)
     ids = np.array([entity.parts[0].object_id for entity in objects], np.int64)
+    grouped = np.array([len(entity.parts) > 1 and index != scene.loose for index, entity in enumerate(objects)], bool)
     for kind, at, turned in (
         (OBJECT.mjOBJ_GEOM, data.geom_xpos, data.geom_xmat),
         (OBJECT.mjOBJ_SITE, data.site_xpos, data.site_xmat),
     ):
-        chosen = np.flatnonzero(kinds == kind)
+        chosen = np.flatnonzero((kinds == kind) & ~grouped)
         position[0, chosen] = at[ids[chosen]]
         rotation[0, chosen] = turned[ids[chosen]].reshape(-1, 3, 3)
+    bodies = model.geom_bodyid[ids[grouped]]
+    position[0, np.flatnonzero(grouped)] = data.xpos[bodies]
+    rotation[0, np.flatnonzero(grouped)] = data.xmat[bodies].reshape(-1, 3, 3)
+    if eye is not None:
+        _follow(model, ids, kinds, position[0], rotation[0], eye)
     for light, entity in area:
         body = body_of_light(model, light)
         world_from_body = data.xmat[body].reshape(3, 3)
@@ -111,6 +129,24 @@ def read_poses(model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> Pose
     return Poses(position, rotation)
 
 
+def _follow(
+    model: mujoco.MjModel,
+    ids: np.ndarray,
+    kinds: np.ndarray,
+    position: np.ndarray,
+    rotation: np.ndarray,
+    eye: np.ndarray,
+) -> None:
+    """Moves the infinite planes in steps along themselves, so that the camera never comes near their ends."""
+    for entity in np.flatnonzero(kinds == OBJECT.mjOBJ_GEOM):
+        geom = ids[entity]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE and (model.geom_size[geom, :2] <= 0.0).any():
+            offset = rotation[entity].T @ (eye - position[entity])
+            for axis in np.flatnonzero(model.geom_size[geom, :2] <= 0.0):
+                step = plane_step(model, geom, int(axis))
+                position[entity] += step * np.round(offset[axis] / step) * rotation[entity][:, axis]
+
+
 class _Build:
     """A scene in the making: shapes and textures are made when the first entity needs them."""
 
@@ -120,19 +156,50 @@ class _Build:
         self.entities: list[Entity] = []
         self.textures: list[Texture] = []
         self._places: dict[ShapeKey, int] = {}
+        self._meshes: dict[ShapeKey, Mesh] = {}
         self._texture_places: dict[int, int] = {}
 
     def add(self, key: ShapeKey, kind: str, index: int, rgba: np.ndarray, material: int, *, casts: bool) -> None:
         """Adds the geom or site of this shape and look."""
+        part, alpha = self._part(kind, index, rgba, material), float(rgba[3])
+        opacity = 1.0 if alpha >= OPAQUE else alpha
+        self.entities.append(Entity(part.name, self._place(key), (part,), opacity=opacity, casts=casts))
+
+    def add_group(self, geoms: tuple[int, ...]) -> None:
+        """Adds geoms of one body that make up one shape, in the frame of the body."""
+        model, keys = self.model, [geom_shape_key(self.model, geom) for geom in geoms]
+        rotations = np.zeros((len(geoms), 9))
+        for rotation, geom in zip(rotations, geoms, strict=True):
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        positions, rotations = model.geom_pos[list(geoms)], rotations.reshape(-1, 3, 3)
+        # Both arms of a robot share the shapes of their links.
+        joint = ("group", tuple(keys), positions.tobytes(), rotations.tobytes())
+        meshes = [self._mesh(key) for key in keys if key is not None]
+        body = int(model.geom_bodyid[geoms[0]])
+        if joint not in self._places:
+            self._places[joint] = len(self.shapes)
+            placed = list(zip(meshes, positions, rotations, strict=True))
+            self.shapes.append(join_meshes(label(model, "body", body), placed))
+        parts = [self._part("geom", geom, self.shown.geom_rgba[geom], int(model.geom_matid[geom])) for geom in geoms]
+        face_part = np.repeat(np.arange(len(geoms)), [len(mesh.faces) for mesh in meshes]).astype(np.int32)
+        self.entities.append(Entity(label(model, "body", body), self._places[joint], tuple(parts), face_part))
+
+    def _place(self, key: ShapeKey) -> int:
+        """Where the shape is among the shapes."""
         if key not in self._places:
             self._places[key] = len(self.shapes)
-            self.shapes.append(make_shape(self.model, key))
-        name, alpha = label(self.model, kind, index), float(rgba[3])
+            self.shapes.append(self._mesh(key))
+        return self._places[key]
+
+    def _mesh(self, key: ShapeKey) -> Mesh:
+        if key not in self._meshes:
+            self._meshes[key] = make_shape(self.model, key)
+        return self._meshes[key]
+
+    def _part(self, kind: str, index: int, rgba: np.ndarray, material: int) -> Part:
         look = make_material(self.model, rgba, material, self._space)
         object_type = OBJECT.mjOBJ_GEOM if kind == "geom" else OBJECT.mjOBJ_SITE
-        part = Part(name, look, index, int(object_type), self._texture(material))
-        opacity = 1.0 if alpha >= OPAQUE else alpha
-        self.entities.append(Entity(name, self._places[key], (part,), opacity=opacity, casts=casts))
+        return Part(label(self.model, kind, index), look, index, int(object_type), self._texture(material))
 
     def add_light(self, light: AreaLight) -> None:
         """Adds the shining body of an area light; lights that were given the same mesh share it, like geoms."""
@@ -149,11 +216,3 @@ class _Build:
             self._texture_places[texture] = len(self.textures)
             self.textures.append(read_texture(self.model, texture, self._space))
         return self._texture_places.get(texture, -1)
-
-
-def _undrawn(model: mujoco.MjModel) -> list[str]:
-    """Names of what the model shows and this library does not."""
-    names = [label(model, "flex", index) for index in range(model.nflex)]
-    names += [label(model, "skin", index) for index in range(model.nskin)]
-    images = [index for index in range(model.nlight) if light_kind(model, index) is None]
-    return names + [f"{label(model, 'light', index)} (image)" for index in images]

@@ -33,6 +33,19 @@ def plane_sizes(model: mujoco.MjModel, sizes: np.ndarray) -> tuple[float, float]
     return x, y
 
 
+def plane_step(model: mujoco.MjModel, geom: int, axis: int) -> float:
+    """The steps in which an infinite plane follows the camera along its axis 0 or 1: a quarter of its half side.
+
+    They are whole periods of its texture, so that the pattern stays where it is.
+    """
+    step = 0.25 * plane_sizes(model, np.zeros(2))[axis]
+    material = int(model.geom_matid[geom])
+    repeat = float(model.mat_texrepeat[material, axis]) if material >= 0 else 0.0
+    # MuJoCo's own steps, two spans of the texture's repetition.
+    period = 4.0 / repeat if repeat > 0.0 else step
+    return max(round(step / period), 1) * period
+
+
 def geom_shape_key(model: mujoco.MjModel, geom: int) -> ShapeKey | None:
     """What tells a geom's shape from others'; None for a geom that has none."""
     kind, which = GEOM(model.geom_type[geom]), int(model.geom_dataid[geom])

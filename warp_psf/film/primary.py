@@ -1,8 +1,9 @@
 """Primary visibility: which surfaces each pixel sees, and with which shares.
 
-Every pixel traces its centre. Where neighbouring pixels see different surfaces, the pixel is traced again at eight
-places, its samples are grouped by surface, and each group becomes a receiver of its own with the group's share as its
-weight: edges are antialiased and nothing is shaded twice.
+Every pixel traces its centre. Where neighbouring pixels see different surfaces, or the centre meets a see-through one,
+the pixel is traced again at eight places, its samples are grouped by surface, and each group becomes a receiver of its
+own with the group's share as its weight: edges are antialiased, what lies behind a pane is seen through it, and nothing
+is shaded twice.
 
 The receivers of a world are numbered so that slot p < pixels is the centre of pixel p, with the share of the group
 that is like it, and EXTRA_GROUPS further slots belong to each edge pixel, in the order of the pixels.
@@ -11,18 +12,26 @@ that is like it, and EXTRA_GROUPS further slots belong to each edge pixel, in th
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from warp_psf.device import launch
+from warp_psf.film.camera_rays import (
+    CameraTable,
+    TileTable,
+    camera_origin,
+    camera_ray,
+    fill_tiles,
+    make_camera_table,
+    make_tiles,
+    tile_of,
+    write_cameras,
+)
+from warp_psf.film.tracing import Hit, opacity_from_behind, surface_of, trace
 from warp_psf.scene.camera import Camera
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, may_hit
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable, make_receivers
+from warp_psf.scene.scene import Scene
 
-# Angles are taken this much wider than they come out in float32, so that no body is lost at the rim of a tile.
-TILE_MARGIN = 1.001
-# Pixels along the side of a tile; rays only meet the entities whose bounding spheres reach into their tile's cone.
-TILE = 16
 SAMPLES = 8
 EXTRA_GROUPS = 3
 # Neighbouring pixels lie on one smooth surface when their normals differ by less than acos(0.9), about 26 degrees,
@@ -31,40 +40,7 @@ SAME_NORMAL = wp.constant(0.9)
 SAME_DEPTH = wp.constant(0.02)
 # Room for edge pixels, as a share of all; further edges of a picture that is nearly all edge stay aliased.
 EDGE_SHARE = 1.0 / 3.0
-
-
-@wp.struct
-class CameraTable:
-    """The film's camera in every world."""
-
-    position: wp.array(dtype=wp.vec3)  # (world), metres
-    rotation: wp.array(dtype=wp.mat33)  # (world), world_from_camera
-    tangent: wp.array(dtype=wp.float32)  # (world): tan(fovy / 2)
-    width: wp.int32
-    height: wp.int32
-
-
-@wp.struct
-class TileTable:
-    """Which entities each tile of the film can see, the nearest first."""
-
-    count: wp.array2d(dtype=wp.int32)  # (world, tile)
-    entity: wp.array3d(dtype=wp.int32)  # (world, tile, place)
-    distance: wp.array3d(dtype=wp.float32)  # (world, tile, place): to the bounding sphere, metres
-    columns: wp.int32
-
-
-@wp.struct
-class Hit:
-    """What a camera ray meets; entity -1 is nothing."""
-
-    entity: wp.int32
-    face: wp.int32
-    u: wp.float32
-    v: wp.float32
-    distance: wp.float32
-    position: wp.vec3
-    normal: wp.vec3
+four_normals = wp.types.matrix(shape=(EXTRA_GROUPS + 1, 3), dtype=wp.float32)
 
 
 @dataclass(frozen=True)
@@ -73,11 +49,14 @@ class Surfaces:
 
     receivers: ReceiverTable
     extra: wp.array  # (world, pixel) int32
-    edge: wp.array  # (world, pixel) int32, 1 on edge pixels
-    edge_rank: wp.array  # (world, pixel) int32, running count of edge pixels
-    edge_capacity: int  # 0: no antialiasing
+    edge: wp.array  # (world, pixel) int32, 1 on edge pixels and where the centre meets a see-through surface
+    edge_rank: wp.array  # (world, pixel) int32, running count of those
+    edge_capacity: int  # how many of them have extra slots
+    antialias: bool
+    see_through: bool  # whether every pixel has them where it needs them
     camera: CameraTable
     tiles: TileTable
+    back: wp.array  # (entity) float32, how opaque it is from behind, as a share
 
     @property
     def slots(self) -> int:
@@ -86,128 +65,12 @@ class Surfaces:
 
 
 @wp.func
-def sample_offset(sample: int) -> wp.vec2:
-    """Eight places in a pixel, one in each row and column of an 8 x 8 grid."""
+def sample_offset(sample: int, samples: int) -> wp.vec2:
+    """Eight places in a pixel, one in each row and column of an 8 x 8 grid; of a single sample, the centre."""
+    if samples == 1:
+        return wp.vec2(0.5, 0.5)
     column = (sample * 5 + 2) % 8
     return wp.vec2((float(column) + 0.5) / 8.0, (float(sample) + 0.5) / 8.0)
-
-
-@wp.func
-def camera_ray(camera: CameraTable, world: int, x: float, y: float) -> wp.vec3:
-    """Direction through the film at pixel coordinates (x, y), of unit depth along the optical axis."""
-    scale = 2.0 * camera.tangent[world] / float(camera.height)
-    right = (x - 0.5 * float(camera.width)) * scale
-    up = (0.5 * float(camera.height) - y) * scale
-    return camera.rotation[world] * wp.vec3(right, up, -1.0)
-
-
-@wp.func
-def angle_between(a: wp.vec3, b: wp.vec3) -> float:
-    """The angle between two vectors, which keeps its digits where acos has none left."""
-    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, tiles: TileTable):
-    world, tile = wp.tid()
-    tile += first
-    size = float(wp.static(TILE))
-    x = float(tile % tiles.columns) * size
-    y = float(tile / tiles.columns) * size
-    axis = wp.normalize(camera_ray(camera, world, x + 0.5 * size, y + 0.5 * size))
-    half_angle = float(0.0)
-    for corner in range(4):
-        ray = camera_ray(camera, world, x + size * float(corner % 2), y + size * float(corner / 2))
-        half_angle = wp.max(half_angle, angle_between(axis, ray))
-    half_angle = wp.static(TILE_MARGIN) * half_angle
-    count = int(0)
-    for entity in range(geometry.entity_mesh.shape[0]):
-        center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
-        offset = center - camera.position[world]
-        distance = wp.length(offset)
-        radius = geometry.radius[entity]
-        seen = distance <= radius
-        if not seen:
-            seen = angle_between(axis, offset) < half_angle + wp.static(TILE_MARGIN) * wp.asin(radius / distance)
-        if seen:
-            gap = distance - radius
-            place = count
-            while place > 0 and tiles.distance[world, tile, wp.max(place - 1, 0)] > gap:
-                tiles.entity[world, tile, place] = tiles.entity[world, tile, place - 1]
-                tiles.distance[world, tile, place] = tiles.distance[world, tile, place - 1]
-                place -= 1
-            tiles.entity[world, tile, place] = entity
-            tiles.distance[world, tile, place] = gap
-            count += 1
-    tiles.count[world, tile] = count
-
-
-@wp.func
-def tile_of(tiles: TileTable, pixel: int, width: int) -> int:
-    """The tile that a pixel lies in."""
-    return (pixel / width / wp.static(TILE)) * tiles.columns + (pixel % width) / wp.static(TILE)
-
-
-@wp.func
-def trace(
-    geometry: GeometryTable,
-    poses: PoseTable,
-    tiles: TileTable,
-    tile: int,
-    world: int,
-    origin: wp.vec3,
-    direction: wp.vec3,
-) -> Hit:
-    """The nearest surface along a camera ray; `distance` is in units of `direction`, entity -1 is nothing."""
-    hit = Hit()
-    hit.entity = -1
-    nearest = float(1.0e30)
-    length_squared = wp.dot(direction, direction)
-    for place in range(tiles.count[world, tile]):
-        entity = tiles.entity[world, tile, place]
-        position = poses.position[world, entity]
-        rotation = poses.rotation[world, entity]
-        to_center = position + rotation * geometry.center[entity] - origin
-        along = wp.dot(to_center, direction)
-        radius = geometry.radius[entity]
-        # Discriminant of the ray against the bounding sphere, and whether the sphere lies ahead and near enough.
-        beside = to_center - (along / length_squared) * direction
-        reach = length_squared * (radius * radius - wp.dot(beside, beside))
-        if reach >= 0.0:
-            root = wp.sqrt(reach)
-            if along + root > 0.0 and along - root < nearest * length_squared:
-                inverse = wp.transpose(rotation)
-                origin_entity = inverse * (origin - position)
-                direction_entity = inverse * direction
-                if may_hit(geometry, entity, origin_entity, direction_entity, nearest):
-                    query = wp.mesh_query_ray(
-                        geometry.mesh_id[geometry.entity_mesh[entity]], origin_entity, direction_entity, nearest
-                    )
-                    if query.result:
-                        nearest = query.t
-                        hit.entity = entity
-                        hit.face = query.face
-                        hit.u = query.u
-                        hit.v = query.v
-                        hit.normal = query.normal
-    if hit.entity >= 0:
-        hit.distance = nearest
-        hit.position = origin + nearest * direction
-        rotation = poses.rotation[world, hit.entity]
-        flat = rotation * hit.normal
-        mesh = geometry.entity_mesh[hit.entity]
-        corners = geometry.faces[geometry.first_face[mesh] + hit.face]
-        start = geometry.first_vertex[mesh]
-        smooth = (
-            hit.u * geometry.normals[start + corners[0]]
-            + hit.v * geometry.normals[start + corners[1]]
-            + (1.0 - hit.u - hit.v) * geometry.normals[start + corners[2]]
-        )
-        normal = wp.normalize(rotation * smooth)
-        if wp.dot(flat, direction) > 0.0:
-            normal = -normal  # the back of an open surface
-        hit.normal = normal
-    return hit
 
 
 @wp.func
@@ -229,16 +92,21 @@ def _trace_centers(
     poses: PoseTable,
     camera: CameraTable,
     tiles: TileTable,
+    back: wp.array(dtype=wp.float32),  # (entity)
     receivers: ReceiverTable,
+    edge_out: wp.array2d(dtype=wp.int32),
 ):
     world, pixel = wp.tid()
     pixel += first
     x = float(pixel % camera.width) + 0.5
     y = float(pixel / camera.width) + 0.5
     tile = tile_of(tiles, pixel, camera.width)
+    origin = camera_origin(camera, world, x, y)
     ray = camera_ray(camera, world, x, y)
-    hit = trace(geometry, poses, tiles, tile, world, camera.position[world], ray)
+    sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray)
+    hit = surface_of(geometry, poses, world, sight, 0, origin, ray)
     store_hit(receivers, world, pixel, hit, wp.where(hit.entity >= 0, 1.0, 0.0))
+    edge_out[world, pixel] = wp.where(sight.panes > 0, 1, 0)
 
 
 @wp.func
@@ -257,7 +125,7 @@ def same_surface(receivers: ReceiverTable, world: int, a: int, b: int) -> bool:
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _find_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge_out: wp.array2d(dtype=wp.int32)):
+def _add_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge: wp.array2d(dtype=wp.int32)):
     world, pixel = wp.tid()
     pixel += first
     x = pixel % camera.width
@@ -271,7 +139,34 @@ def _find_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge_
         smooth = smooth and same_surface(receivers, world, pixel, pixel - camera.width)
     if y + 1 < camera.height:
         smooth = smooth and same_surface(receivers, world, pixel, pixel + camera.width)
-    edge_out[world, pixel] = wp.where(smooth, 0, 1)
+    if not smooth:
+        edge[world, pixel] = 1
+
+
+@wp.func
+def group_of(geometry: GeometryTable, entities: wp.vec4i, normals: four_normals, groups: int, hit: Hit) -> int:
+    """The group of a pixel that a hit belongs to; `groups` where it opens another."""
+    found = int(-1)
+    for group in range(groups):
+        if entities[group] == hit.entity and (
+            found < 0 or wp.dot(normals[group], hit.normal) > wp.dot(normals[found], hit.normal)
+        ):
+            found = group
+    known = found >= 0
+    if known:
+        known = wp.dot(normals[found], hit.normal) > SAME_NORMAL
+    if not known and groups < wp.static(EXTRA_GROUPS + 1):
+        return groups
+    if found < 0:
+        # No room for another entity: the first group stands for it that is see-through if it is, else the first.
+        clear = geometry.opacity[hit.entity] < 1.0
+        alike = bool(False)
+        for group in range(groups):
+            if entities[group] >= 0 and not alike:
+                alike = (geometry.opacity[entities[group]] < 1.0) == clear
+                if alike or found < 0:
+                    found = group
+    return found
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -281,9 +176,11 @@ def _trace_edges(
     poses: PoseTable,
     camera: CameraTable,
     tiles: TileTable,
+    back: wp.array(dtype=wp.float32),  # (entity)
     edge: wp.array2d(dtype=wp.int32),
     edge_rank: wp.array2d(dtype=wp.int32),
     edge_capacity: int,
+    samples: int,
     receivers: ReceiverTable,
     extra_out: wp.array2d(dtype=wp.int32),
 ):
@@ -295,40 +192,39 @@ def _trace_edges(
         slot = camera.width * camera.height + wp.static(EXTRA_GROUPS) * rank
         extra_out[world, pixel] = slot
         tile = tile_of(tiles, pixel, camera.width)
-        share = 1.0 / float(wp.static(SAMPLES))
+        share = 1.0 / float(samples)
         entities = wp.vec4i(receivers.entity[world, pixel], -1, -1, -1)
-        normals = wp.matrix(shape=(4, 3), dtype=float)
+        normals = four_normals()
         normals[0] = receivers.normal[world, pixel]
         weights = wp.vec4()
         # Group 0 is what the centre sees, be it nothing: depth and segmentation are the centre's.
         groups = int(1)
         x = float(pixel % camera.width)
         y = float(pixel / camera.width)
-        samples = int(wp.static(SAMPLES))  # a variable keeps the loop from being unrolled
         for sample in range(samples):
-            offset = sample_offset(sample)
+            offset = sample_offset(sample, samples)
+            origin = camera_origin(camera, world, x + offset[0], y + offset[1])
             ray = camera_ray(camera, world, x + offset[0], y + offset[1])
-            hit = trace(geometry, poses, tiles, tile, world, camera.position[world], ray)
-            if hit.entity >= 0:
-                found = int(-1)
-                for group in range(groups):
-                    if entities[group] == hit.entity and (
-                        found < 0 or wp.dot(normals[group], hit.normal) > wp.dot(normals[found], hit.normal)
-                    ):
-                        found = group
-                known = found >= 0
-                if known:
-                    known = wp.dot(normals[found], hit.normal) > SAME_NORMAL
-                if not known and groups < wp.static(EXTRA_GROUPS + 1):
-                    found = groups
-                    entities[found] = hit.entity
-                    normals[found] = hit.normal
-                    store_hit(receivers, world, slot + found - 1, hit, 0.0)
-                    groups += 1
-                if found < 0:
-                    # No room for another entity: a group that there is stands for it.
-                    found = wp.where(entities[0] >= 0, 0, 1)
-                weights[found] += share
+            sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray)
+            behind = float(share)
+            for place in range(sight.panes):
+                behind *= 1.0 - wp.abs(sight.pane_opacity[place])
+            left = float(share)
+            for turn in range(sight.panes + 1):
+                # What is behind the panes comes first, so that it finds room however many they are.
+                place = wp.where(turn == 0, sight.panes, turn - 1)
+                hit = surface_of(geometry, poses, world, sight, place, origin, ray)
+                weight = wp.where(turn == 0, behind, left * hit.opacity)
+                if turn > 0:
+                    left -= weight
+                if hit.entity >= 0:
+                    found = group_of(geometry, entities, normals, groups, hit)
+                    if found == groups:
+                        entities[found] = hit.entity
+                        normals[found] = hit.normal
+                        store_hit(receivers, world, slot + found - 1, hit, 0.0)
+                        groups += 1
+                    weights[found] += weight
         receivers.weight[world, pixel] = weights[0]
         for group in range(1, groups):
             receivers.weight[world, slot + group - 1] = weights[group]
@@ -336,58 +232,53 @@ def _trace_edges(
             receivers.entity[world, slot + group - 1] = -1
 
 
-def make_surfaces(worlds: int, width: int, height: int, entities: int, antialias: bool, device: wp.Device) -> Surfaces:
-    """Room for the surfaces of a film of width x height pixels; without `antialias` a pixel is its centre."""
+def make_surfaces(
+    worlds: int, width: int, height: int, scene: Scene, antialias: bool, see_through: bool, device: wp.Device
+) -> Surfaces:
+    """Room for the surfaces of a film of width x height pixels.
+
+    antialias: without it a pixel is its centre. see_through: whether there is to be room behind panes at every pixel; a
+    pixel without sees its pane as if that were opaque.
+    """
     pixels = width * height
-    capacity = math.ceil(EDGE_SHARE * pixels) if antialias else 0
-    shape = (worlds, pixels + EXTRA_GROUPS * capacity)
-    receivers = make_receivers(shape, device)
+    capacity = pixels if see_through else math.ceil(EDGE_SHARE * pixels) if antialias else 0
+    receivers = make_receivers((worlds, pixels + EXTRA_GROUPS * capacity), device)
     receivers.entity.fill_(-1)
-    camera = CameraTable()
-    camera.position = wp.zeros(worlds, dtype=wp.vec3, device=device)
-    camera.rotation = wp.zeros(worlds, dtype=wp.mat33, device=device)
-    camera.tangent = wp.zeros(worlds, dtype=wp.float32, device=device)
-    camera.width, camera.height = width, height
     extra, edge, rank = (wp.zeros((worlds, pixels), dtype=wp.int32, device=device) for _ in range(3))
-    tiles = TileTable()
-    tiles.columns = math.ceil(width / TILE)
-    shape = (worlds, tiles.columns * math.ceil(height / TILE))
-    tiles.count = wp.zeros(shape, dtype=wp.int32, device=device)
-    tiles.entity = wp.zeros((*shape, entities), dtype=wp.int32, device=device)
-    tiles.distance = wp.zeros((*shape, entities), dtype=wp.float32, device=device)
-    return Surfaces(receivers, extra, edge, rank, capacity, camera, tiles)
+    return Surfaces(
+        receivers=receivers,
+        extra=extra,
+        edge=edge,
+        edge_rank=rank,
+        edge_capacity=capacity,
+        antialias=antialias,
+        see_through=see_through,
+        camera=make_camera_table(worlds, width, height, device),
+        tiles=make_tiles(worlds, width, height, len(scene.entities), device),
+        back=opacity_from_behind(scene, device),
+    )
 
 
 def aim(surfaces: Surfaces, cameras: list[Camera]) -> None:
     """Points the film's camera, one per world."""
-    table = surfaces.camera
-    table.position.assign(np.array([camera.position for camera in cameras], np.float32))
-    table.rotation.assign(np.array([camera.rotation for camera in cameras], np.float32))
-    table.tangent.assign(np.array([math.tan(0.5 * camera.fovy) for camera in cameras], np.float32))
+    write_cameras(surfaces.camera, cameras)
 
 
 def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> None:
     """Fills `surfaces` with what the camera sees of the scene in its present poses."""
-    camera, receivers = surfaces.camera, surfaces.receivers
+    camera, receivers, tiles = surfaces.camera, surfaces.receivers, surfaces.tiles
     dim = surfaces.edge.shape
-    tiles = surfaces.tiles
-    launch(_fill_tiles, tiles.count.shape, [scene.geometry, scene.poses, camera, tiles], [], device)
-    launch(_trace_centers, dim, [scene.geometry, scene.poses, camera, tiles, receivers], [], device)
+    fill_tiles(scene, camera, tiles, device)
+    views = [scene.geometry, scene.poses, camera, tiles, surfaces.back]
+    launch(_trace_centers, dim, [*views, receivers], [surfaces.edge], device)
     if surfaces.edge_capacity == 0:
         surfaces.extra.fill_(-1)
         return
-    launch(_find_edges, dim, [camera, receivers], [surfaces.edge], device)
+    if surfaces.antialias:
+        launch(_add_edges, dim, [camera, receivers], [surfaces.edge], device)
     wp.utils.array_scan(surfaces.edge.flatten(), surfaces.edge_rank.flatten(), inclusive=False)
     # What an earlier frame left in slots that this frame's edges do not reach.
     receivers.entity[:, dim[1] :].fill_(-1)
-    inputs = [
-        scene.geometry,
-        scene.poses,
-        camera,
-        tiles,
-        surfaces.edge,
-        surfaces.edge_rank,
-        surfaces.edge_capacity,
-        receivers,
-    ]
+    samples = SAMPLES if surfaces.antialias else 1
+    inputs = [*views, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, samples, receivers]
     launch(_trace_edges, dim, inputs, [surfaces.extra], device)

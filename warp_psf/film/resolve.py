@@ -7,7 +7,8 @@ import numpy as np
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.film.primary import EXTRA_GROUPS, SAMPLES, CameraTable, Surfaces, camera_ray
+from warp_psf.film.camera_rays import CameraTable, camera_ray
+from warp_psf.film.primary import EXTRA_GROUPS, Surfaces
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
 from warp_psf.scene.receiver import ReceiverTable
 
@@ -122,7 +123,7 @@ def _resolve_pixels(
     layers.direct[world, pixel] = light
     layers.indirect[world, pixel] = bounced
     color = light + bounced + shine
-    if covered < 1.0 - wp.static(0.5 / SAMPLES):
+    if covered < 1.0:
         color += (1.0 - covered) * look_up(background, camera_ray(camera, world, x, y))
     layers.color[world, pixel] = color
     layers.albedo[world, pixel] = albedo

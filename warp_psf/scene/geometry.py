@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.scene.loose import Loose
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Poses, Scene
 
@@ -72,18 +73,18 @@ class DeviceScene:
 
     geometry: GeometryTable
     poses: PoseTable
-    meshes: tuple[wp.Mesh, ...]
+    meshes: list[wp.Mesh]
 
 
 def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     """Puts a scene's meshes and materials on the device, with room for the poses of `worlds` simulations."""
-    meshes = tuple(
+    meshes = [
         wp.Mesh(
             points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
             indices=wp.array(mesh.faces.reshape(-1), dtype=wp.int32, device=device),
         )
         for mesh in scene.meshes
-    )
+    ]
     table = GeometryTable()
     table.mesh_id = wp.array([mesh.id for mesh in meshes], dtype=wp.uint64, device=device)
     table.first_vertex = wp.array(_starts(mesh.vertices for mesh in scene.meshes), dtype=wp.int32, device=device)
@@ -138,6 +139,45 @@ def write_poses(device_scene: DeviceScene, poses: Poses) -> None:
     """Brings the poses of a frame to the device."""
     device_scene.poses.position.assign(poses.position)
     device_scene.poses.rotation.assign(poses.rotation)
+
+
+def write_loose(device_scene: DeviceScene, scene: Scene, loose: Loose | None) -> None:
+    """Brings the present shape of the scene's loose entity to the device; None leaves nothing of it."""
+    table, entity = device_scene.geometry, scene.loose
+    mesh = scene.entities[entity].mesh
+    # A box that is inside out is hit by nothing.
+    lower, upper, center, radius = np.full(3, 1e30), np.full(3, -1e30), np.zeros(3), 0.0
+    if loose is not None:
+        lower, upper = loose.vertices.min(axis=0), loose.vertices.max(axis=0)
+        center = 0.5 * (lower + upper)
+        radius = float(np.linalg.norm(loose.vertices - center, axis=1).max())
+        device = table.vertices.device
+        first_vertex, first_face = (sum(len(part) for part in parts) for parts in _before(scene, mesh))
+        _write(table.vertices, first_vertex, loose.vertices)
+        _write(table.normals, first_vertex, loose.normals)
+        _write(table.faces, first_face, loose.faces)
+        first_part = sum(len(other.parts) for other in scene.entities[:entity])
+        _write(table.face_part, len(table.face_part) - len(scene.entities[entity].face_part), loose.face_part)
+        _write(table.albedo, first_part, np.array([part.material.albedo for part in loose.parts], np.float32))
+        _write(table.emission, first_part, np.array([part.material.emission for part in loose.parts], np.float32))
+        _write(table.object_id, first_part, np.array([part.object_id for part in loose.parts], np.int32))
+        _write(table.object_type, first_part, np.array([part.object_type for part in loose.parts], np.int32))
+        points = wp.array(loose.vertices, dtype=wp.vec3, device=device)
+        indices = wp.array(loose.faces.reshape(-1), dtype=wp.int32, device=device)
+        device_scene.meshes[mesh] = wp.Mesh(points=points, indices=indices)
+        _write(table.mesh_id, mesh, np.array([device_scene.meshes[mesh].id], np.uint64))
+    _write(table.lower, entity, lower[None].astype(np.float32))
+    _write(table.upper, entity, upper[None].astype(np.float32))
+    _write(table.center, entity, center[None].astype(np.float32))
+    _write(table.radius, entity, np.array([radius], np.float32))
+
+
+def _before(scene: Scene, mesh: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    return [shape.vertices for shape in scene.meshes[:mesh]], [shape.faces for shape in scene.meshes[:mesh]]
+
+
+def _write(array: wp.array, first: int, values: np.ndarray) -> None:
+    array[first : first + len(values)].assign(values)
 
 
 def _starts(arrays) -> np.ndarray:

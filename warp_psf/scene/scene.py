@@ -59,12 +59,16 @@ class Entity:
 
 @dataclass(frozen=True)
 class Scene:
-    """The unchanging part: shapes, entities, their textures, and the lights that move with them."""
+    """The unchanging part: shapes, entities, their textures, and the lights that move with them.
+
+    loose: the entity that stands for everything without a rigid shape, -1 for none.
+    """
 
     meshes: tuple[Mesh, ...]
     entities: tuple[Entity, ...]
     lights: tuple[Light, ...]
     textures: tuple[Texture, ...] = ()
+    loose: int = -1
 
 
 @dataclass(frozen=True)

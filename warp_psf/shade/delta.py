@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_psf.basis import sphere
 from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, may_hit
 from warp_psf.scene.light import DeltaLight
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
@@ -17,6 +17,9 @@ from warp_psf.scene.scene import Scene
 # Shadow rays towards a bulb with a radius. When the first few, spread over the bulb, agree, the rest are left out.
 BULB_RAYS = 48
 FIRST_BULB_RAYS = 12
+# Entities in the way of a light that are kept in a list; where there are more, every ray asks all of the scene's.
+MOST_LISTED = 16
+listed_entities = wp.types.vector(MOST_LISTED, wp.int32)
 # A shadow ray starts this share of the bounding radius off a body that can shadow itself: its smooth normals lift
 # receivers off the flat faces that the ray would meet.
 SHADOW_OFFSET = 2.0e-3
@@ -41,12 +44,57 @@ class DeltaLightTable:
     shadows_itself: wp.array(dtype=wp.bool)  # (entity): False for convex and for flat bodies
 
 
+@wp.struct
+class InTheWay:
+    """The entities that can stand between a receiver and a light; `listed` is False where they are too many."""
+
+    count: wp.int32
+    listed: wp.bool
+    entity: listed_entities
+
+
+@wp.func
+def find_in_the_way(
+    world: int,
+    own: int,
+    p: wp.vec3,
+    toward: wp.vec3,
+    spread: float,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    opacity: wp.array(dtype=wp.float32),  # (entity)
+    shadows_itself: wp.array(dtype=wp.bool),  # (entity)
+) -> InTheWay:
+    """Which entities reach into the cone from p, on the entity `own`, to a disc of radius `spread` at p + toward."""
+    found = InTheWay()
+    found.listed = True
+    length_squared = wp.dot(toward, toward)
+    length = wp.sqrt(length_squared)
+    for entity in range(geometry.entity_mesh.shape[0]):
+        if opacity[entity] > 0.0 and (entity != own or shadows_itself[entity]):
+            radius = geometry.radius[entity]
+            to_center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity] - p
+            nearest = wp.clamp(wp.dot(to_center, toward) / length_squared, 0.0, 1.0)
+            # The cone where it leaves the entity's sphere is as wide as it gets there.
+            reach = radius + spread * wp.min(nearest + radius / length, 1.0)
+            if wp.length_sq(to_center - nearest * toward) < reach * reach:
+                if found.count < wp.static(MOST_LISTED):
+                    found.entity[found.count] = entity
+                    found.count += 1
+                else:
+                    found.listed = False
+    if not found.listed:
+        found.count = geometry.entity_mesh.shape[0]
+    return found
+
+
 @wp.func
 def share_passed(
     world: int,
     own: int,
     p: wp.vec3,
     toward: wp.vec3,
+    found: InTheWay,
     geometry: GeometryTable,
     poses: PoseTable,
     opacity: wp.array(dtype=wp.float32),  # (entity)
@@ -55,8 +103,11 @@ def share_passed(
     """The share of light that what stands on the segment from p to p + toward, which starts on `own`, lets through."""
     passed = float(1.0)
     length_squared = wp.dot(toward, toward)
-    for entity in range(geometry.entity_mesh.shape[0]):
-        if opacity[entity] > 0.0 and (entity != own or shadows_itself[entity]):
+    for place in range(found.count):
+        entity = place
+        if found.listed:
+            entity = found.entity[place]
+        if found.listed or (opacity[entity] > 0.0 and (entity != own or shadows_itself[entity])):
             position = poses.position[world, entity]
             rotation = poses.rotation[world, entity]
             radius = geometry.radius[entity]
@@ -65,15 +116,13 @@ def share_passed(
             nearest = wp.clamp(wp.dot(to_center, toward) / length_squared, 0.0, 1.0)
             if wp.length_sq(to_center - nearest * toward) < radius * radius:
                 inverse = wp.transpose(rotation)
-                if wp.mesh_query_ray_anyhit(
-                    geometry.mesh_id[geometry.entity_mesh[entity]],
-                    inverse * (p - position),
-                    inverse * toward,
-                    1.0,
-                ):
-                    passed *= 1.0 - opacity[entity]
-                    if passed <= 0.0:
-                        return 0.0
+                start = inverse * (p - position)
+                way = inverse * toward
+                if may_hit(geometry, entity, start, way, 1.0):
+                    if wp.mesh_query_ray_anyhit(geometry.mesh_id[geometry.entity_mesh[entity]], start, way, 1.0):
+                        passed *= 1.0 - opacity[entity]
+                        if passed <= 0.0:
+                            return 0.0
     return passed
 
 
@@ -123,9 +172,14 @@ def delta_light(
     lit = float(0.0)
     if cosine > 0.0 and strength > 0.0:
         lit = 1.0
+        radius = wp.where(kind == wp.static(KINDS["directional"]), 0.0, lights.radius[world, light])
+        found = InTheWay()
         if lights.casts[world, light]:
-            radius = lights.radius[world, light]
-            if radius > 0.0 and kind != wp.static(KINDS["directional"]):
+            found = find_in_the_way(
+                world, entity, origin, toward, radius, geometry, poses, opacity, lights.shadows_itself
+            )
+        if found.count > 0:
+            if radius > 0.0:
                 # A disc that faces the receiver stands for the bulb.
                 disc = sphere.frame_of(unit)
                 open_rays = float(0.0)
@@ -139,11 +193,13 @@ def delta_light(
                         aimed = toward + radius * (disc * wp.vec3(place[0], place[1], 0.0))
                         cast += 1
                         open_rays += share_passed(
-                            world, entity, origin, aimed, geometry, poses, opacity, lights.shadows_itself
+                            world, entity, origin, aimed, found, geometry, poses, opacity, lights.shadows_itself
                         )
                 lit = open_rays / float(cast)
             else:
-                lit = share_passed(world, entity, origin, toward, geometry, poses, opacity, lights.shadows_itself)
+                lit = share_passed(
+                    world, entity, origin, toward, found, geometry, poses, opacity, lights.shadows_itself
+                )
     return unit, strength, lit, cosine
 
 

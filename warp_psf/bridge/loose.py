@@ -1,0 +1,139 @@
+"""Tendons, skins and flexes as MuJoCo's visualiser shapes them in a frame, and the geoms that a script has added."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from warp_psf.bridge import solids
+from warp_psf.bridge.look import make_material
+from warp_psf.bridge.model import label
+from warp_psf.bridge.shapes import MESHES
+from warp_psf.bridge.solids import Surface
+from warp_psf.scene.loose import Loose
+from warp_psf.scene.scene import Part
+
+GEOM, OBJECT = mujoco.mjtGeom, mujoco.mjtObj
+# MuJoCo's arrows: how much wider the head is than the shaft.
+HEAD = 1.75
+DECOR = mujoco.mjtCatBit.mjCAT_DECOR
+
+
+def read_loose(
+    model: mujoco.MjModel, view: mujoco.MjvScene, shown: int, material_space: str, metres_per_pixel: float
+) -> Loose | None:
+    """What has no rigid shape in MuJoCo's abstract scene, None where there is nothing of that.
+
+    view: after mjv_updateScene. shown: how many geoms that left in it; those behind were added by a script and are
+    drawn too, while MuJoCo's own decor (contacts, frames, joints) is not. metres_per_pixel: at a distance of 1 m, for
+    lines, whose width is in pixels.
+    """
+    surfaces: list[Surface] = []
+    parts: list[Part] = []
+    eye = 0.5 * (np.array(view.camera[0].pos) + np.array(view.camera[1].pos))
+    for index, geom in enumerate(view.geoms[: view.ngeom]):
+        added = index >= shown
+        if added or (geom.objtype not in (OBJECT.mjOBJ_GEOM, OBJECT.mjOBJ_SITE) and geom.category != DECOR):
+            if geom.rgba[3] > 0.0:
+                surface = _surface(model, view, geom, eye, metres_per_pixel)
+                if surface is not None and len(surface[2]) > 0:
+                    surfaces.append(surface)
+                    parts.append(_part(model, geom, material_space))
+    if not surfaces:
+        return None
+    counts = np.array([len(vertices) for vertices, _, _ in surfaces])
+    starts = np.cumsum(counts) - counts
+    faces = np.concatenate([faces + start for (_, _, faces), start in zip(surfaces, starts, strict=True)])
+    return Loose(
+        np.concatenate([vertices for vertices, _, _ in surfaces]).astype(np.float32),
+        np.concatenate([normals for _, normals, _ in surfaces]).astype(np.float32),
+        faces.astype(np.int32),
+        np.repeat(np.arange(len(parts)), [len(faces) for _, _, faces in surfaces]).astype(np.int32),
+        tuple(parts),
+    )
+
+
+def _part(model: mujoco.MjModel, geom: mujoco.MjvGeom, material_space: str) -> Part:
+    kinds = {OBJECT.mjOBJ_TENDON: "tendon", OBJECT.mjOBJ_FLEX: "flex", OBJECT.mjOBJ_SKIN: "skin"}
+    kind = kinds.get(geom.objtype)
+    name = label(model, kind, geom.objid) if kind else "added geom"
+    material = make_material(model, np.array(geom.rgba), int(geom.matid), material_space)
+    return Part(name, material, int(geom.objid), int(geom.objtype))
+
+
+def _surface(
+    model: mujoco.MjModel, view: mujoco.MjvScene, geom: mujoco.MjvGeom, eye: np.ndarray, metres_per_pixel: float
+) -> Surface | None:
+    """Vertices, normals and faces of a geom in the world; None for what has no surface."""
+    if geom.type == GEOM.mjGEOM_FLEX:
+        return _flex(view, geom)
+    if geom.type == GEOM.mjGEOM_SKIN:
+        return _skin(model, view, geom.objid)
+    size = np.array(geom.size, np.float64)
+    position, rotation = np.array(geom.pos, np.float64), np.array(geom.mat, np.float64).reshape(3, 3)
+    thickness = 0.5 * size[0] * metres_per_pixel * float(np.linalg.norm(position - eye))
+    if geom.type in MESHES and geom.dataid >= 0:
+        return solids.place(_model_mesh(model, geom.dataid // 2), position, rotation)
+    if geom.type == GEOM.mjGEOM_LINE:
+        return solids.place(solids.rod(thickness, 0.0, size[2]), position, rotation)
+    if geom.type == GEOM.mjGEOM_LINEBOX:
+        return solids.place(solids.wires(size, thickness / max(size[0], 1e-9)), position, rotation)
+    local = _solid(int(geom.type), size)
+    return None if local is None else solids.place(local, position, rotation)
+
+
+def _flex(view: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Surface | None:
+    """A flex: its faces, and where it has none the tubes along its edges."""
+    which, radius = int(geom.objid), float(geom.size[0])
+    used = int(view.flexfaceused[which])
+    if used > 0:
+        corners = slice(9 * int(view.flexfaceadr[which]), 9 * (int(view.flexfaceadr[which]) + used))
+        vertices = np.asarray(view.flexface[corners]).reshape(-1, 3)
+        normals = np.asarray(view.flexnormal[corners]).reshape(-1, 3)
+        return vertices, normals, np.arange(3 * used).reshape(-1, 3)
+    if radius <= 0.0:
+        return None
+    first = int(view.flexvertadr[which])
+    start, count = int(view.flexedgeadr[which]), int(view.flexedgenum[which])
+    points = np.asarray(view.flexvert, np.float64).reshape(-1, 3)
+    ends = points[first + np.asarray(view.flexedge[2 * start : 2 * (start + count)]).reshape(-1, 2)]
+    return solids.join(*(solids.tube(a, b, radius) for a, b in ends)) if count else None
+
+
+def _skin(model: mujoco.MjModel, view: mujoco.MjvScene, which: int) -> Surface:
+    first, count = int(view.skinvertadr[which]), int(view.skinvertnum[which])
+    rows = slice(3 * first, 3 * (first + count))
+    vertices, normals = (np.asarray(values[rows]).reshape(-1, 3) for values in (view.skinvert, view.skinnormal))
+    faces = slice(model.skin_faceadr[which], model.skin_faceadr[which] + model.skin_facenum[which])
+    return vertices, normals, np.asarray(model.skin_face[faces])
+
+
+def _model_mesh(model: mujoco.MjModel, which: int) -> Surface:
+    vertices = slice(model.mesh_vertadr[which], model.mesh_vertadr[which] + model.mesh_vertnum[which])
+    faces = slice(model.mesh_faceadr[which], model.mesh_faceadr[which] + model.mesh_facenum[which])
+    return solids.faceted(np.asarray(model.mesh_vert[vertices], np.float64), np.asarray(model.mesh_face[faces]))
+
+
+def _solid(kind: int, size: np.ndarray) -> Surface | None:
+    """A geom of MuJoCo's in its own frame."""
+    x, y, z = size
+    if kind in (GEOM.mjGEOM_SPHERE, GEOM.mjGEOM_ELLIPSOID):
+        return solids.scaled(solids.capsule(1.0, 0.0), size)
+    if kind == GEOM.mjGEOM_CAPSULE:
+        return solids.capsule(x, z)
+    if kind == GEOM.mjGEOM_CYLINDER:
+        return solids.rod(x, -z, z)
+    if kind == GEOM.mjGEOM_BOX:
+        return solids.scaled(solids.cube(), size)
+    if kind == GEOM.mjGEOM_PLANE and x > 0.0 and y > 0.0:
+        corners = np.array(((-x, -y, 0.0), (x, -y, 0.0), (x, y, 0.0), (-x, y, 0.0)))
+        return solids.two_sided(corners)
+    if kind in (GEOM.mjGEOM_ARROW, GEOM.mjGEOM_ARROW1):
+        wide = HEAD if kind == GEOM.mjGEOM_ARROW else 1.0
+        return solids.join(solids.rod(x, 0.0, z / 3.0), solids.cone(wide * x, z / 3.0, 2.0 * z / 3.0))
+    if kind == GEOM.mjGEOM_ARROW2:
+        heads = [solids.cone(HEAD * x, side * z / 3.0, side * 2.0 * z / 3.0) for side in (1.0, -1.0)]
+        return solids.join(solids.rod(x, -z / 3.0, z / 3.0), *heads)
+    if kind == GEOM.mjGEOM_TRIANGLE:
+        return solids.two_sided(np.array(((0.0, 0.0, 0.0), (x, 0.0, 0.0), (0.0, y, 0.0))))
+    return None
