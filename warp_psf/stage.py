@@ -23,6 +23,7 @@ from warp_psf.scene.geometry import DeviceScene, upload_scene, write_poses
 from warp_psf.scene.light import DeltaLight, area_light_entities
 from warp_psf.scene.loose import LooseRoom
 from warp_psf.scene.scene import Poses, Scene
+from warp_psf.scene.tint import TextureTable, upload_textures
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
 from warp_psf.shade.delta import DeltaState, add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import DirectState, shade_direct, upload_lighting, write_environment
@@ -32,6 +33,7 @@ from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice
 from warp_psf.shade.occlude import OcclusionState, turn_occlusion, upload_occlusion
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
+from warp_psf.shade.tint import tint_proxies
 
 Progress = Callable[[str, float], None]
 Received = tuple[wp.array, wp.array]
@@ -70,6 +72,7 @@ class Stage:
     scene: Scene
     room: LooseRoom | None
     device_scene: DeviceScene
+    textures: TextureTable
     occlusion: OcclusionState
     lighting: DirectState
     delta_lights: DeltaState
@@ -140,6 +143,7 @@ def set_stage(
         scene=scene,
         room=room,
         device_scene=device_scene,
+        textures=upload_textures(scene, device),
         occlusion=occlusion,
         lighting=lighting,
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
@@ -197,7 +201,7 @@ def draw(stage: Stage) -> None:
     if stage.bounces is not None and stage.last_gather is not None:
         _bounce(stage, stage.bounces, stage.last_gather)
     with _timed(stage, "resolve pixels"):
-        resolve_pixels(stage.film, surfaces, scene, stage.received, stage.bounced, device)
+        resolve_pixels(stage.film, surfaces, scene, stage.textures, stage.received, stage.bounced, device)
 
 
 def _shade_pixels(stage: Stage) -> None:
@@ -230,6 +234,7 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
     if stage.has_moved:
         with _timed(stage, "basis irradiances"):
             gather_basis_irradiances(bounces, scene, *lights, settings.bounce_threshold, device)
+            tint_proxies(bounces, scene, stage.textures, device)
         stage.has_moved = False
     with _timed(stage, "light on proxies"):
         shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, *bounces.received, device)

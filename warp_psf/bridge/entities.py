@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from warp_psf.bridge.grouping import group_geoms
 from warp_psf.bridge.lights import body_of_light, model_lights_of
 from warp_psf.bridge.look import SPACES, find_texture, make_material, read_texture
+from warp_psf.bridge.mapping import make_mapping, mesh_coordinates
 from warp_psf.bridge.model import check_data, label
 from warp_psf.bridge.shapes import ShapeKey, geom_shape_key, make_shape, plane_step, site_shape_key
 from warp_psf.bridge.shown import OPAQUE, Shown, find_shown
@@ -19,7 +21,7 @@ from warp_psf.scene.loose import LooseRoom, reserve
 from warp_psf.scene.material import Material
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Entity, Part, Poses, Scene
-from warp_psf.scene.texture import Texture
+from warp_psf.scene.texture import Texture, Wrap
 
 OBJECT = mujoco.mjtObj
 
@@ -162,8 +164,9 @@ class _Build:
     def add(self, key: ShapeKey, kind: str, index: int, rgba: np.ndarray, material: int, *, casts: bool) -> None:
         """Adds the geom or site of this shape and look."""
         part, alpha = self._part(kind, index, rgba, material), float(rgba[3])
-        opacity = 1.0 if alpha >= OPAQUE else alpha
-        self.entities.append(Entity(part.name, self._place(key), (part,), opacity=opacity, casts=casts))
+        opacity, mesh = 1.0 if alpha >= OPAQUE else alpha, self._mesh(key)
+        given = self._coordinates(index, mesh) if part.mapping.wrap == Wrap.GIVEN else None
+        self.entities.append(Entity(part.name, self._place(key), (part,), None, given, opacity, casts))
 
     def add_group(self, geoms: tuple[int, ...]) -> None:
         """Adds geoms of one body that make up one shape, in the frame of the body."""
@@ -181,8 +184,23 @@ class _Build:
             placed = list(zip(meshes, positions, rotations, strict=True))
             self.shapes.append(join_meshes(label(model, "body", body), placed))
         parts = [self._part("geom", geom, self.shown.geom_rgba[geom], int(model.geom_matid[geom])) for geom in geoms]
+        parts = [
+            replace(part, mapping=replace(part.mapping, position=position, rotation=rotation))
+            for part, position, rotation in zip(parts, positions, rotations, strict=True)
+        ]
+        given = None
+        if any(part.mapping.wrap == Wrap.GIVEN for part in parts):
+            pairs = list(zip(geoms, meshes, parts, strict=True))
+            given = np.concatenate([self._coordinates(geom, mesh, part.mapping.wrap) for geom, mesh, part in pairs])
         face_part = np.repeat(np.arange(len(geoms)), [len(mesh.faces) for mesh in meshes]).astype(np.int32)
-        self.entities.append(Entity(label(model, "body", body), self._places[joint], tuple(parts), face_part))
+        name = label(model, "body", body)
+        self.entities.append(Entity(name, self._places[joint], tuple(parts), face_part, given))
+
+    def _coordinates(self, geom: int, mesh: Mesh, wrap: Wrap = Wrap.GIVEN) -> np.ndarray:
+        """What a geom's mesh brings of texture coordinates, zeros where a formula gives them; float32 [F, 3, 2]."""
+        if wrap != Wrap.GIVEN:
+            return np.zeros((len(mesh.faces), 3, 2), np.float32)
+        return mesh_coordinates(self.model, int(self.model.geom_dataid[geom]), mesh)
 
     def _place(self, key: ShapeKey) -> int:
         """Where the shape is among the shapes."""
@@ -199,7 +217,17 @@ class _Build:
     def _part(self, kind: str, index: int, rgba: np.ndarray, material: int) -> Part:
         look = make_material(self.model, rgba, material, self._space)
         object_type = OBJECT.mjOBJ_GEOM if kind == "geom" else OBJECT.mjOBJ_SITE
-        return Part(label(self.model, kind, index), look, index, int(object_type), self._texture(material))
+        name = label(self.model, kind, index)
+        texture = find_texture(self.model, material) if self.shown.textured else -1
+        if texture < 0:
+            return Part(name, look, index, int(object_type))
+        model = self.model
+        if kind == "geom":
+            shape = int(model.geom_type[index]), model.geom_size[index], int(model.geom_dataid[index])
+        else:
+            shape = int(model.site_type[index]), model.site_size[index], -1
+        mapping = make_mapping(model, *shape, material, texture)
+        return Part(name, look, index, int(object_type), self._texture(texture), mapping)
 
     def add_light(self, light: AreaLight) -> None:
         """Adds the shining body of an area light; lights that were given the same mesh share it, like geoms."""
@@ -210,9 +238,9 @@ class _Build:
         part = Part(light.name, shine, -1, int(OBJECT.mjOBJ_UNKNOWN))
         self.entities.append(Entity(light.name, known, (part,), casts=False))
 
-    def _texture(self, material: int) -> int:
-        texture = find_texture(self.model, material) if self.shown.textured else -1
-        if texture >= 0 and texture not in self._texture_places:
+    def _texture(self, texture: int) -> int:
+        """Where a texture of the model's is among the textures."""
+        if texture not in self._texture_places:
             self._texture_places[texture] = len(self.textures)
             self.textures.append(read_texture(self.model, texture, self._space))
-        return self._texture_places.get(texture, -1)
+        return self._texture_places[texture]

@@ -98,8 +98,8 @@ def _height_field(model: mujoco.MjModel, which: int) -> Mesh:
     top = np.stack([x, y, height * data], axis=2).reshape(-1, 3)
     number = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    # Quads are cut from the corner (0, 1) to (1, 0), as MuJoCo's triangle strips are.
-    surface = np.concatenate([np.stack([a, b, d], axis=1), np.stack([b, c, d], axis=1)])
+    # Quads are cut from the first corner to the last, as MuJoCo's picture has them.
+    surface = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     rim = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
     bottom = top[rim] * (1.0, 1.0, 0.0) - (0.0, 0.0, base)
     below, next_rim = len(top) + np.arange(len(rim)), np.roll(rim, -1)

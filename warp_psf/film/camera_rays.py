@@ -111,7 +111,8 @@ def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: C
         if seen:
             gap = distance - radius
             place = count
-            while place > 0 and tiles.distance[world, tile, wp.max(place - 1, 0)] > gap:
+            # The later of two that lie in one place comes first, and so is what is seen: MuJoCo draws it last.
+            while place > 0 and tiles.distance[world, tile, wp.max(place - 1, 0)] >= gap:
                 tiles.entity[world, tile, place] = tiles.entity[world, tile, place - 1]
                 tiles.distance[world, tile, place] = tiles.distance[world, tile, place - 1]
                 place -= 1

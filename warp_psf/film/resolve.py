@@ -7,10 +7,14 @@ import numpy as np
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.film.camera_rays import CameraTable, camera_ray
+from warp_psf.film.camera_rays import CameraTable, camera_origin, camera_ray
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
 from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.tint import TextureTable, tint_of
+
+# A pixel covers at most so much of a surface that it sees edge-on, in bounding radii of the body.
+LONGEST_FOOTPRINT = 0.5
 
 
 @wp.struct
@@ -73,6 +77,52 @@ def shows_front(receivers: ReceiverTable, world: int, slot: int, geometry: Geome
     return wp.dot(poses.rotation[world, entity] * outward, receivers.normal[world, slot]) > 0.0
 
 
+@wp.func
+def on_plane(camera: CameraTable, world: int, x: float, y: float, p: wp.vec3, n: wp.vec3, longest: float) -> wp.vec3:
+    """From p to where the ray through the film at (x, y) meets the plane through p with normal n; at most `longest`."""
+    origin = camera_origin(camera, world, x, y)
+    ray = camera_ray(camera, world, x, y)
+    along = wp.dot(ray, n)
+    # A plane that is seen edge-on is met far away, or behind the viewer.
+    steep = wp.where(wp.abs(along) > 1.0e-6, along, 1.0e-6)
+    step = origin + (wp.dot(p - origin, n) / steep) * ray - p
+    length = wp.length(step)
+    return wp.where(length > longest, longest / wp.max(length, 1.0e-20), 1.0) * step
+
+
+@wp.func
+def seen_tint(
+    world: int,
+    pixel: int,
+    slot: int,
+    receivers: ReceiverTable,
+    geometry: GeometryTable,
+    poses: PoseTable,
+    camera: CameraTable,
+    textures: TextureTable,
+    part: int,
+) -> wp.vec3:
+    """What the texture at a receiver multiplies its colour with, over what the pixel covers of its tangent plane."""
+    entity = receivers.entity[world, slot]
+    p = receivers.position[world, slot]
+    n = receivers.normal[world, slot]
+    x = float(pixel % camera.width) + 0.5
+    y = float(pixel / camera.width) + 0.5
+    longest = wp.static(LONGEST_FOOTPRINT) * geometry.radius[entity]
+    to_entity = wp.transpose(poses.rotation[world, entity])
+    return tint_of(
+        textures,
+        geometry,
+        entity,
+        part,
+        receivers.face[world, slot],
+        to_entity * (p - poses.position[world, entity]),
+        to_entity * n,
+        to_entity * on_plane(camera, world, x + 1.0, y, p, n, longest),
+        to_entity * on_plane(camera, world, x, y + 1.0, p, n, longest),
+    )
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _resolve_pixels(
     first: int,
@@ -85,6 +135,7 @@ def _resolve_pixels(
     glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
     indirect_diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
     indirect_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    textures: TextureTable,
     background: wp.array2d(dtype=wp.vec3),
     layers: LayerTable,
 ):
@@ -107,13 +158,17 @@ def _resolve_pixels(
             weight = receivers.weight[world, slot]
             part = part_of(geometry, entity, receivers.face[world, slot])
             reflectance = geometry.albedo[part]
+            emission = geometry.emission[part]
+            if textures.texture[part] >= 0:
+                tint = seen_tint(world, pixel, slot, receivers, geometry, poses, camera, textures, part)
+                reflectance = wp.cw_mul(tint, reflectance)
+                emission = wp.cw_mul(tint, emission)
             lobe = geometry.specular[entity]
             lambert = reflectance * wp.static(1.0 / math.pi)
             light += weight * (wp.cw_mul(lambert, diffuse[world, slot]) + wp.cw_mul(lobe, glossy[world, slot]))
             bounced += weight * (
                 wp.cw_mul(lambert, indirect_diffuse[world, slot]) + wp.cw_mul(lobe, indirect_glossy[world, slot])
             )
-            emission = geometry.emission[part]
             if wp.max(emission) > 0.0:
                 # Surfaces shine from their fronts.
                 shine += wp.where(shows_front(receivers, world, slot, geometry, poses), weight, 0.0) * emission
@@ -156,6 +211,7 @@ def resolve_pixels(
     film: Film,
     surfaces: Surfaces,
     scene: DeviceScene,
+    textures: TextureTable,
     direct: tuple[wp.array, wp.array],
     indirect: tuple[wp.array, wp.array],
     device: wp.Device,
@@ -165,7 +221,7 @@ def resolve_pixels(
     direct, indirect: irradiance and radiance through the Phong lobe, vec3 (world, slot) each.
     """
     inputs = [scene.geometry, scene.poses, surfaces.camera, surfaces.receivers, surfaces.extra, *direct, *indirect]
-    launch(_resolve_pixels, surfaces.extra.shape, [*inputs, film.background, film.layers], [], device)
+    launch(_resolve_pixels, surfaces.extra.shape, [*inputs, textures, film.background, film.layers], [], device)
 
 
 LAYERS = ("color", "direct", "indirect", "albedo", "normal", "depth", "segmentation")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from warp_psf.scene.light import Light
 from warp_psf.scene.material import Material
 from warp_psf.scene.mesh import Mesh
-from warp_psf.scene.texture import Texture
+from warp_psf.scene.texture import Mapping, Texture, Wrap
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,7 @@ class Part:
     material: its reflectance and emission; a texture multiplies the albedo and the emission.
     object_id, object_type: MuJoCo's id and type (mjtObj) of the thing, for the segmentation layer.
     texture: index into `Scene.textures`, -1 for none.
+    mapping: how the texture lies on the part.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Part:
     object_id: int
     object_type: int
     texture: int = -1
+    mapping: Mapping = field(default_factory=lambda: Mapping(Wrap.FLAT))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +39,8 @@ class Entity:
     mesh: index into `Scene.meshes`; entities with the same shape share a mesh.
     parts: one, or several where geoms of one body have one shape together; their lobes are the first one's.
     face_part: which part each face of the mesh belongs to, int32 [F]; None when there is only one.
-    texture_coordinates: of each face's corners, float32 [F, 3, 3]: (s, t, 0) in a flat texture, a direction in a cube;
-        None without a texture.
+    texture_coordinates: (s, t) of each face's corners, float32 [F, 3, 2], for parts whose mesh brings its own; else
+        None.
     opacity: the share of light that it stops, in (0, 1].
     casts: False for what is only seen: it takes no light from others and sends none.
     """

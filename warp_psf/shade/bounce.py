@@ -325,6 +325,7 @@ class BounceState:
     own_light: wp.array  # vec3 (world, own vertex): irradiance there from the body itself
     turns: wp.array  # int32 (world, proxy): 1, but 0 for proxies of glossy bodies, which `shade_moments` shades
     tint: wp.array  # vec3 (world, proxy): what a texture multiplies its albedo with
+    spacing: wp.array  # (body proxy): about how far apart a body's proxies lie, metres
     received: tuple[wp.array, wp.array]  # irradiance and Phong radiance of direct light
     radiance: wp.array  # vec3 (world, proxy): the light that leaves after the last bounce
     total: wp.array  # vec3 (world, proxy): and after all bounces so far

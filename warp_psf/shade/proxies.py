@@ -10,6 +10,7 @@ from warp_psf.field.radiance import BasisRadianceField, make_summed, upload_radi
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import make_receivers
 from warp_psf.scene.scene import Scene
+from warp_psf.scene.topology import area_vectors
 from warp_psf.shade.between import MOST_SOURCES
 from warp_psf.shade.bounce import BounceState, make_bounce
 from warp_psf.shade.gloss import GlossState
@@ -61,7 +62,7 @@ def upload_bounces(
     share = int(np.clip(MOST_PROXIES // max(len(chosen), 1), FEWEST_PROXIES_PER_BODY, MOST_PROXIES_PER_BODY))
 
     field_of, counts, starts, solver_starts = (np.full(len(radiating), -1, np.int64) for _ in range(4))
-    points, normals, faces, corners, solvers, own, total, solved = [], [], [], [], [], [], 0, 0
+    points, normals, faces, corners, spacings, solvers, own, total, solved = [], [], [], [], [], [], [], 0, 0
     for entity in chosen:
         mesh, baked = radiating[entity]
         vertices = baked.proxies[:share]
@@ -73,6 +74,8 @@ def upload_bounces(
         face_of, corner_of = _faces_of(mesh)
         faces.append(face_of[vertices])
         corners.append(corner_of[vertices])
+        area = 0.5 * np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1).sum()
+        spacings.append(np.full(len(vertices), np.sqrt(area / max(len(vertices), 1))))
         solvers.append(baked.solver(len(vertices)).ravel())
         from_itself = baked.self_irradiance
         own.append(np.zeros((len(vertices), functions)) if from_itself is None else from_itself[vertices])
@@ -125,6 +128,7 @@ def upload_bounces(
         *_upload_own(radiating, functions, worlds, device),
         upload(np.repeat(turns[None], worlds, axis=0), wp.int32),
         wp.full((worlds, slots), wp.vec3(1.0), dtype=wp.vec3, device=device),
+        upload(np.concatenate([np.zeros(0), *spacings]), wp.float32),
         tuple(wp.zeros((worlds, slots), dtype=wp.vec3, device=device) for _ in range(2)),
         wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
         wp.zeros((worlds, slots), dtype=wp.vec3, device=device),
