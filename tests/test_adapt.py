@@ -1,10 +1,11 @@
-"""How shells are thinned out: Equation 1, the interpolation rules, and what the reduction promises."""
+"""How shells are filled coarse to fine and thinned out: Equation 1, interpolation, and what both promise."""
 
 import numpy as np
 import pytest
 
 from warp_psf.bake import adapt
 from warp_psf.bake.adapt import ERROR_THRESHOLD, interpolate_double, reduce_shell, vector_error
+from warp_psf.bake.shell import AGREEMENT_INSIDE, fill_shell
 from warp_psf.basis import sh, sphere
 from warp_psf.field.shells import sample_directions
 
@@ -108,3 +109,61 @@ def test_samples_that_nobody_reads_do_not_count():
     matters[10:40, 20:50] = False
     assert len(reduce_shell(shell, ERROR_THRESHOLD, matters)) < 64
     assert len(reduce_shell(shell, ERROR_THRESHOLD, np.zeros((64, 64), bool))) == 8
+
+
+def filled(shell, inside=None, known=None, radii=0.5):
+    """A shell filled from its true vectors, and which samples were cast, bool [R, R]."""
+    cast = np.zeros(shell.shape[0] * shell.shape[1], bool)
+
+    def give(chosen):
+        assert not cast[chosen].any()
+        cast[chosen] = True
+        return shell.reshape(len(cast), -1)[chosen]
+
+    none = np.zeros(shell.shape[:2], bool)
+    given = None if known is None else np.where(known[..., None], np.float32(7.0), np.float32(0.0)) + 0 * shell
+    found = fill_shell(given, none if known is None else known, none if inside is None else inside, radii, give)
+    return found, cast.reshape(shell.shape[:2])
+
+
+@pytest.mark.parametrize(("frequency", "most"), [(0.1, 0.07), (0.5, 0.3), (4.0, 1.0)])
+def test_samples_are_cast_where_the_shell_varies(frequency, most):
+    shell = smooth_shell(frequency, 0.2)
+    found, cast = filled(shell)
+    assert 16 * 16 <= cast.sum() <= most * cast.size
+    np.testing.assert_array_equal(found[cast], shell[cast])
+    # Linear and cubic interpolation agree to the limit, and the cubic one errs by less than their difference.
+    assert vector_error(found - shell).max() < AGREEMENT_INSIDE
+
+
+def test_smooth_shells_are_filled_across_seam_and_poles():
+    # Linear in the position: smooth everywhere, also where rows and columns end.
+    shell = (0.02 * sample_directions(64) @ np.random.default_rng(3).normal(size=(3, 16))).astype(np.float32)
+    found, cast = filled(shell)
+    assert cast.sum() == 16 * 16
+    np.testing.assert_allclose(found, shell, atol=2e-4)  # cubic, over four samples of 22 degrees of azimuth
+
+
+def test_nothing_is_interpolated_between_inside_and_outside():
+    inside = np.zeros((64, 64), bool)
+    inside[:20] = True
+    shell = np.where(inside[..., None], 0.004, 0.0).astype(np.float32) * np.ones(16, np.float32)
+    found, cast = filled(shell, inside)
+    np.testing.assert_array_equal(found, shell)
+    assert cast[17:23].all()
+    assert not cast[40:].all()
+
+
+def test_known_samples_are_kept_and_not_cast():
+    known = np.zeros((64, 64), bool)
+    known[10:30, 5:50] = True
+    found, cast = filled(np.zeros((64, 64, 16), np.float32), known=known)
+    assert (found[known] == 7.0).all()
+    assert not cast[known].any()
+
+
+def test_small_shells_are_cast_whole():
+    shell = smooth_shell(0.1, 0.2)[::4, ::4]
+    found, cast = filled(shell)
+    assert cast.all()
+    np.testing.assert_array_equal(found, shell)

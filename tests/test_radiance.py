@@ -11,6 +11,7 @@ from tests.oracles_bake import trace
 from warp_psf.bake import gather, radiance
 from warp_psf.bake.body import upload_mesh
 from warp_psf.bake.radiance import bake_radiance
+from warp_psf.bake.shape import unit_shape
 from warp_psf.basis import sh, sphere
 from warp_psf.device import find_device, launch
 from warp_psf.field.radiance import (
@@ -403,7 +404,9 @@ def test_buried_parts_have_no_light_and_no_proxies():
 def test_a_white_cavity_lights_itself_all_around(hollow, device):
     """Every point of a closed white cavity receives pi, whatever its shape; the outside of a ball nothing."""
     ones = np.ones((len(hollow.vertices), 4), np.float32)
-    found = radiance._gather_on_itself(hollow, upload_mesh(hollow, device), ones, device)
+    sight = radiance._look_at_itself(hollow, upload_mesh(hollow, device), device)
+    assert sight is not None
+    found = radiance._gather_on_itself(sight, ones, device)
     inside = np.linalg.norm(hollow.vertices, axis=1) < 0.8
     np.testing.assert_allclose(found[inside], np.pi, rtol=0.005)  # rays through an edge between faces
     np.testing.assert_allclose(found[~inside], 0.0)
@@ -490,11 +493,11 @@ def test_bakes_are_kept_and_broken_ones_baked_again(monkeypatch, tmp_path):
     assert kept.field.radius == baked.field.radius
     (file,) = cache_folder().glob("*.field")
     key = file.stem
-    field = replace(baked.field, covered=baked.field.covered[:-1])
-    radiance.save_radiance(key, baked.basis, baked.proxies, baked.self_irradiance, field)
+    field, unit = replace(baked.field, covered=baked.field.covered[:-1]), unit_shape(mesh)
+    radiance.save_radiance(key, unit, baked.basis, baked.proxies, baked.self_irradiance, field)
     with pytest.warns(UserWarning, match="wrong 'covered'"):
         bake_radiance(mesh, functions=4)
-    radiance.save_radiance(key, baked.basis, baked.proxies + 10**6, None, baked.field)
+    radiance.save_radiance(key, unit, baked.basis, baked.proxies + 10**6, None, baked.field)
     with pytest.warns(UserWarning, match="wrong 'proxies'"):
         mended = bake_radiance(mesh, functions=4)
     np.testing.assert_array_equal(mended.proxies, baked.proxies)

@@ -224,8 +224,7 @@ def test_a_bake_survives_a_folder_that_cannot_be_written(folder, cheap_bake):
 
 WRONG = {
     "codes": lambda a: a[:-1],
-    "center": lambda a: a[:2],
-    "radius": lambda a: np.array([1.0, 2.0]),
+    "surface": lambda a: a[:, :3],
     "resolutions": lambda a: a * 0 + 12,
     "minimum": lambda a: a.astype(np.float64),
     "step": lambda a: a * np.nan,
@@ -262,11 +261,54 @@ def test_another_setting_is_another_file(folder, cheap_bake):
     psf.bake_mesh(tetrahedron(), 2)
     psf.bake_mesh(tetrahedron(), 3)
     psf.bake_mesh(tetrahedron(), 2, threshold=0.02)
-    psf.bake_mesh(psf.make_mesh("tetrahedron", VERTICES * 1.5, FACES), 2)
+    psf.bake_mesh(psf.make_mesh("tetrahedron", VERTICES * np.float32([1.5, 1, 1]), FACES), 2)
     assert len(list(folder.iterdir())) == 4
     psf.bake_mesh(psf.make_mesh("the same under another name", VERTICES, FACES), 2)
     psf.bake_mesh(tetrahedron(), 4, use_cache=False)
     assert len(list(folder.iterdir())) == 4
+
+
+def test_a_shape_is_kept_once_whatever_its_size_and_place(folder, cheap_bake):
+    baked = psf.bake_mesh(tetrahedron(), 2)
+    moved = psf.make_mesh("large", VERTICES * np.float32(3.7) + np.float32([0.1, -0.2, 0.3]), FACES)
+    large = psf.bake_mesh(moved, 2)
+    only_file(folder)
+    assert baked.field is not None and large.field is not None
+    for name in ("resolutions", "codes", "minimum", "step"):
+        np.testing.assert_array_equal(getattr(large.field, name), getattr(baked.field, name))
+    np.testing.assert_allclose(large.field.center, moved.center, rtol=1e-6)
+    assert large.field.radius == pytest.approx(3.7 * baked.field.radius, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "turn",
+    [
+        np.diag([1.0, 1.0, -1.0]),  # a mirror image: turned inside out as well
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.diag([1.0, 1.0, 1.001]),
+    ],
+    ids=["mirrored", "turned", "stretched"],
+)
+def test_another_shape_is_kept_apart(folder, cheap_bake, turn):
+    baked = psf.bake_mesh(tetrahedron(), 2)
+    faces = FACES if np.linalg.det(turn) > 0 else FACES[:, ::-1]
+    other = psf.bake_mesh(psf.make_mesh("other", (VERTICES @ turn.T).astype(np.float32), faces), 2)
+    assert baked.field is not None and other.field is not None
+    assert len(list(folder.iterdir())) == 2
+    assert (other.field.minimum != baked.field.minimum).any()
+
+
+def test_a_shape_is_told_from_another_of_the_same_key(folder, cheap_bake, monkeypatch):
+    monkeypatch.setattr("warp_psf.bake.shape.MOMENT_STEP", 1e6)  # every shape of these faces has the same key
+    baked = psf.bake_mesh(tetrahedron(), 2)
+    longer = psf.make_mesh("longer", VERTICES * np.float32([1, 1, 1.2]), FACES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # nothing is damaged
+        other = psf.bake_mesh(longer, 2)
+    only_file(folder)
+    assert baked.field is not None and other.field is not None
+    assert (other.field.minimum != baked.field.minimum).any()
+    assert_same_field(other, psf.bake_mesh(longer, 2, use_cache=False))
 
 
 def _bake_in_child(barrier, results):

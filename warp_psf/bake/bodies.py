@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from queue import SimpleQueue
+from threading import Event
+from typing import TypeVar
 
 from warp_psf.bake.body import bake_mesh
 from warp_psf.bake.kept import BakedBody
 from warp_psf.bake.radiance import BakedRadiance, bake_radiance
+from warp_psf.bake.shape import shape_key, unit_shape
+from warp_psf.device import core_count, find_device
 from warp_psf.scene.detail import refine_radiating
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
@@ -15,6 +22,7 @@ from warp_psf.scene.scene import Scene
 # centre would serve badly what lies on them, so that their light leaves through textured faces instead.
 THICK = 0.25
 Progress = Callable[[str, float], None]
+T = TypeVar("T")
 
 
 def is_patch(mesh: Mesh) -> bool:
@@ -25,15 +33,15 @@ def is_patch(mesh: Mesh) -> bool:
 def bake_bodies(scene: Scene, casts: list[bool], order: int, device: str, progress: Progress) -> list[BakedBody]:
     """The baked body of every mesh; one that no entity casts a shadow with needs nothing.
 
-    casts: per entity whether it casts shadows: area lights do not. progress: called as progress(what, share).
+    casts: per entity whether it casts shadows: area lights do not. progress: called as progress(what, share), from the
+    thread that calls this.
     """
-    casters = {entity.mesh for entity, casting in zip(scene.entities, casts, strict=True) if casting}
-    return [
-        bake_mesh(mesh, order, device=device, progress=_named(progress, f"baking {mesh.name}"))
-        if index in casters
-        else BakedBody(None, None, None)
-        for index, mesh in enumerate(scene.meshes)
-    ]
+
+    def bake(mesh: Mesh, progress: Progress) -> BakedBody:
+        return bake_mesh(mesh, order, device=device, progress=_named(progress, f"baking {mesh.name}"))
+
+    baked = _bake_shapes(scene, _casting(scene, casts), bake, device, progress)
+    return [baked.get(index, BakedBody(None, None, None)) for index in range(len(scene.meshes))]
 
 
 def bake_light(
@@ -43,18 +51,80 @@ def bake_light(
 
     casts, progress: as in `bake_bodies`. functions: basis functions per body. Patches and lights have None.
     """
-    radiating: dict[int, tuple[Mesh, BakedRadiance]] = {}
-    for index, shape in enumerate(scene.meshes):
-        used = any(entity.mesh == index and casting for entity, casting in zip(scene.entities, casts, strict=True))
-        if used and not is_patch(shape):
-            mesh = refine_radiating(shape)
-            report = _named(progress, f"baking light of {mesh.name}")
-            radiating[index] = mesh, bake_radiance(mesh, order, functions, device=device, progress=report)
+
+    def bake(shape: Mesh, progress: Progress) -> tuple[Mesh, BakedRadiance]:
+        mesh = refine_radiating(shape)
+        report = _named(progress, f"baking light of {mesh.name}")
+        return mesh, bake_radiance(mesh, order, functions, device=device, progress=report)
+
+    radiating = [index for index in _casting(scene, casts) if not is_patch(scene.meshes[index])]
+    baked = _bake_shapes(scene, radiating, bake, device, progress)
     pairs = list(zip(scene.entities, casts, strict=True))
     return (
-        [radiating.get(entity.mesh) if casting else None for entity, casting in pairs],
+        [baked.get(entity.mesh) if casting else None for entity, casting in pairs],
         [casting and is_patch(scene.meshes[entity.mesh]) for entity, casting in pairs],
     )
+
+
+def _casting(scene: Scene, casts: list[bool]) -> list[int]:
+    """The meshes that some entity casts shadows with, in their order."""
+    return sorted({entity.mesh for entity, casting in zip(scene.entities, casts, strict=True) if casting})
+
+
+def _bake_shapes(
+    scene: Scene, indices: list[int], bake: Callable[[Mesh, Progress], T], device: str, progress: Progress
+) -> dict[int, T]:
+    """What `bake` makes of the scene's meshes, by their indices; copies of a shape follow it, who will find it kept."""
+    shapes: dict[str, list[int]] = {}
+    for index in indices:
+        shapes.setdefault(shape_key({}, unit_shape(scene.meshes[index])), []).append(index)
+
+    def bake_copies(copies: list[int], progress: Progress) -> dict[int, T]:
+        return {index: bake(scene.meshes[index], progress) for index in copies}
+
+    # A kernel on the CPU leaves the interpreter to others: what one shape does in NumPy goes on beside another's rays.
+    workers = 1 if find_device(device).is_cuda else core_count()
+    jobs = [partial(bake_copies, copies) for copies in shapes.values()]
+    return {index: baked for part in _run(jobs, workers, progress) for index, baked in part.items()}
+
+
+def _run(jobs: list[Callable[[Progress], T]], workers: int, progress: Progress) -> list[T]:
+    """The jobs' results. They run side by side, are stopped by the first error, and are heard in the calling thread."""
+    if workers == 1 or len(jobs) < 2:
+        return [job(progress) for job in jobs]
+    said: SimpleQueue[tuple[str, float] | None] = SimpleQueue()
+    stopped = Event()
+
+    def say(what: str, share: float) -> None:
+        if stopped.is_set():
+            raise InterruptedError(f"{what} was stopped")
+        said.put((what, share))
+
+    def run(job: Callable[[Progress], T]) -> T:
+        try:
+            return job(say)
+        finally:
+            said.put(None)  # it has ended
+
+    with ThreadPoolExecutor(workers, thread_name_prefix="bake") as pool:
+        futures = [pool.submit(run, job) for job in jobs]
+        try:
+            running = len(futures)
+            while running:
+                heard = said.get()
+                if heard is not None:
+                    progress(*heard)
+                    continue
+                running -= 1
+                for future in futures:
+                    # An ended job has a result soon after it has said so; of the others none is asked.
+                    if future.done():
+                        future.result()
+            return [future.result() for future in futures]
+        except BaseException:
+            stopped.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _named(progress: Progress, what: str) -> Callable[[float], None]:

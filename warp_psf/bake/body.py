@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -12,6 +12,8 @@ import warp as wp
 from warp_psf.bake import visibility
 from warp_psf.bake.adapt import ERROR_THRESHOLD, reduce_shell
 from warp_psf.bake.kept import BakedBody, load_body, save_body
+from warp_psf.bake.shape import shape_key, unit_shape
+from warp_psf.bake.shell import fill_shell
 from warp_psf.bake.transfer import bake_transfer
 from warp_psf.device import find_device
 from warp_psf.field.shells import (
@@ -24,16 +26,15 @@ from warp_psf.field.shells import (
     sample_directions,
     shell_radii,
 )
-from warp_psf.field.store import store_key
 from warp_psf.scene.mesh import Mesh
 
 # Raised whenever the same settings would give other numbers, so that older files on disk are not used.
-BAKE_VERSION = 3
+BAKE_VERSION = 4
 ORDERS = range(2, 7)
 # Samples that left the solid at points this close, in bounding radii, left it at the same point.
 SAME_POINT = 1.0e-5
 Progress = Callable[[float], None]
-Project = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Project = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 
 
 def bake_mesh(
@@ -60,22 +61,28 @@ def bake_mesh(
         return BakedBody(None, None, None)
     settings = {"bake": BAKE_VERSION, "kind": "body", "order": order, "threshold": threshold}
     settings |= {"convex": mesh.convex, "closed": mesh.closed}
-    key = store_key(settings, mesh.vertices, mesh.faces, mesh.normals)
-    body = load_body(key, mesh, order, has_transfer=not mesh.convex) if use_cache else None
+    unit = unit_shape(mesh)
+    key = shape_key(settings, unit)
+    body = load_body(key, unit, order, has_transfer=not mesh.convex) if use_cache else None
     if body is None:
         on_device = find_device(device)
-        warp_mesh = upload_mesh(mesh, on_device)
+        warp_mesh = upload_mesh(unit, on_device)
         transfer, self_visibility = None, None
         if not mesh.convex:
-            transfer, self_visibility = bake_transfer(mesh, warp_mesh, order, on_device)
+            transfer, self_visibility = bake_transfer(unit, warp_mesh, order, on_device)
         report(0.1)
         # The last step is reported once the result is kept.
-        field = bake_field(mesh, warp_mesh, order, threshold, on_device, lambda share: report(0.1 + 0.89 * share))
+        field = bake_field(unit, warp_mesh, order, threshold, on_device, lambda share: report(0.1 + 0.89 * share))
         body = BakedBody(field, transfer, self_visibility)
         if use_cache:
-            save_body(key, body)
+            save_body(key, unit, body)
     report(1.0)
-    return body
+    return BakedBody(_place(body.field, mesh), body.transfer, body.visibility)
+
+
+def _place(field: ShadowField | None, mesh: Mesh) -> ShadowField | None:
+    """The field of a unit shape where the mesh has it."""
+    return field and replace(field, center=mesh.center.astype(np.float32), radius=float(mesh.radius))
 
 
 def bake_radiance_field(
@@ -97,16 +104,17 @@ def bake_radiance_field(
             f"mesh {mesh.name!r}: its radiance has the shape {list(radiance.shape)}; "
             f"give {len(mesh.faces)} finite numbers of at least 0, one per face"
         )
-    key = store_key(settings, mesh.vertices, mesh.faces, radiance)
-    body = load_body(key, mesh, order, has_transfer=False) if use_cache else None
-    if body is not None and body.field is not None:
-        return body.field
-    on_device = find_device(device)
-    warp_mesh = upload_mesh(mesh, on_device)
-    field = bake_field(mesh, warp_mesh, order, ERROR_THRESHOLD, on_device, lambda share: None, radiance)
-    if use_cache:
-        save_body(key, BakedBody(field, None, None))
-    return field
+    unit = unit_shape(mesh)
+    key = shape_key(settings, unit, radiance)
+    body = load_body(key, unit, order, has_transfer=False) if use_cache else None
+    if body is None:
+        on_device = find_device(device)
+        warp_mesh = upload_mesh(unit, on_device)
+        field = bake_field(unit, warp_mesh, order, ERROR_THRESHOLD, on_device, lambda share: None, radiance)
+        body = BakedBody(field, None, None)
+        if use_cache:
+            save_body(key, unit, body)
+    return _place(body.field, mesh)
 
 
 def bake_field(
@@ -119,83 +127,56 @@ def bake_field(
     face_radiance: np.ndarray | None = None,
 ) -> ShadowField:
     """Samples every shell, reduces each of them and quantises it."""
-    inner: list[InnerShell] = []
-    for shell in reversed(range(FIRST_OUTER_SHELL + 1)):
-        inner.insert(0, _bake_inner_shell(mesh, warp_mesh, shell, order, device, face_radiance, inner[:1]))
-        report(len(inner) / SHELL_COUNT)
-    shells, inside = [samples.vectors for samples in inner], [samples.inside for samples in inner]
-    for shell in range(FIRST_OUTER_SHELL + 1, SHELL_COUNT):
-        points, outward = _sample_points(mesh, shell)
-        shells.append(_project(mesh, warp_mesh, shell, points, outward, order, device, face_radiance))
-        inside.append(np.zeros(len(points), bool))
-        report(len(shells) / SHELL_COUNT)
-    grid = (FINEST_RESOLUTION, FINEST_RESOLUTION)
-    shells = [vectors.reshape(*grid, -1) for vectors in shells]
+
+    def project(shell: int, points: np.ndarray, outward: np.ndarray) -> np.ndarray:
+        return _project(mesh, warp_mesh, shell, points, outward, order, device, face_radiance)
+
+    shells, inside = sample_shells(mesh, warp_mesh, SHELL_COUNT, FINEST_RESOLUTION, project, device, report)
     if threshold is not None:
-        inside = [within.reshape(grid) for within in inside]
         shells = [reduce_shell(vectors, threshold, can_be_read(inside, shell)) for shell, vectors in enumerate(shells)]
     return quantise(mesh.center, mesh.radius, shells)
 
 
-@dataclass(frozen=True)
-class InnerShell:
-    """A shell no larger than the bounding sphere.
-
-    points: where each sample was taken, float32 [samples, 3]; inside: which ones had to leave the solid for that;
-    vectors: float32 [samples, coefficients].
-    """
-
-    points: np.ndarray
-    inside: np.ndarray
-    vectors: np.ndarray
-
-
-def _bake_inner_shell(
+def sample_shells(
     mesh: Mesh,
     warp_mesh: wp.Mesh,
-    shell: int,
-    order: int,
-    device: wp.Device,
-    face_radiance: np.ndarray | None,
-    next_shell: list[InnerShell],
-) -> InnerShell:
-    """Samples a shell of an occlusion or source radiance field (see `sample_inner_shell`)."""
-
-    def project(points: np.ndarray, outward: np.ndarray) -> np.ndarray:
-        return _project(mesh, warp_mesh, shell, points, outward, order, device, face_radiance)
-
-    return sample_inner_shell(mesh, warp_mesh, shell, FINEST_RESOLUTION, project, device, next_shell)
-
-
-def sample_inner_shell(
-    mesh: Mesh,
-    warp_mesh: wp.Mesh,
-    shell: int,
+    count: int,
     resolution: int,
     project: Project,
     device: wp.Device,
-    next_shell: list[InnerShell],
-) -> InnerShell:
-    """Samples a shell whose samples may lie inside the solid; `next_shell` holds the one around it, if it has one.
+    report: Progress,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The vectors of `count` shells, each float32 [R, R, K], and which samples lie inside the solid, each bool [R, R].
 
     A sample inside the solid would be covered all around and darken receivers outside. It is moved along its radius
     to the surface instead, where it tells what the nearest receivers outside see. Where the next shell's sample went
-    to the same point, its vector is taken over.
+    to the same point, or nobody can read the sample, the next shell's vector is taken over.
 
-    project: gives the vectors, float32 [N, K], at points [N, 3] whose directions from the centre are known, [N, 3].
+    project: gives the vectors, float32 [N, K], of a shell at points [N, 3] whose directions from the centre are known,
+    [N, 3]: called as project(shell, points, outward). report: called with the share of the shells that are done.
     """
-    points, outward = _sample_points(mesh, shell, resolution)
-    points, inside = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, mesh.closed, points, device)
-    known = np.zeros(len(points), bool)
-    if next_shell:
-        apart = np.linalg.norm(points - next_shell[0].points, axis=1)
-        known = inside & (apart < SAME_POINT * mesh.radius)
-    projected = project(points[~known], outward[~known])
-    vectors = np.empty((len(points), projected.shape[1]), np.float32)
-    vectors[~known] = projected
-    if next_shell:
-        vectors[known] = next_shell[0].vectors[known]
-    return InnerShell(points, inside, vectors)
+    grid = (resolution, resolution)
+    outward = sample_directions(resolution).reshape(-1, 3)
+    places = [_sample_points(mesh, shell, resolution)[0] for shell in range(count)]
+    inside = [np.zeros(grid, bool) for _ in places]
+    inner = FIRST_OUTER_SHELL + 1
+    for shell in range(inner):
+        moved = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, mesh.closed, places[shell], device)
+        places[shell], inside[shell] = moved[0], moved[1].reshape(grid)
+    found: dict[int, np.ndarray] = {}
+    for shell in [*reversed(range(inner)), *range(inner, count)]:
+        known, vectors = np.zeros(grid, bool), None
+        if shell < inner - 1:
+            apart = np.linalg.norm(places[shell] - places[shell + 1], axis=1).reshape(grid)
+            known = inside[shell] & (apart < SAME_POINT * mesh.radius) | ~can_be_read(inside, shell)
+            vectors = found[shell + 1].copy()
+
+        def cast(chosen: np.ndarray, shell: int = shell) -> np.ndarray:
+            return project(shell, places[shell][chosen], outward[chosen])
+
+        found[shell] = fill_shell(vectors, known, inside[shell], SHELL_SPACING * (1 + shell), cast)
+        report(len(found) / count)
+    return [found[shell] for shell in range(count)], inside
 
 
 def _sample_points(mesh: Mesh, shell: int, resolution: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -217,7 +198,11 @@ def _project(
     """The vectors at points of a shell, float32 [N, coefficients], with the rays that its distance asks for."""
     half_angle, rays = cone_of_shell(shell)
     axes = (-outward).astype(np.float32)
-    return visibility.project_coverage(warp_mesh, points, axes, half_angle, rays, order, device, face_radiance)
+    # Outside the bounding sphere the body fills a part of the cone, and most bundles would lie at its edge.
+    solid = mesh.closed and half_angle == math.pi
+    return visibility.project_coverage(
+        warp_mesh, points, axes, half_angle, rays, order, device, face_radiance, solid=solid
+    )
 
 
 def cone_of_shell(shell: int) -> tuple[float, int]:

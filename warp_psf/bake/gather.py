@@ -1,6 +1,8 @@
 """Rays for the basis radiance: lighting a body from points, and gathering functions on its surface elsewhere."""
 
+from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -10,8 +12,11 @@ from warp_psf.device import launch
 
 
 @cache
-def make_gathering(functions: int, count: int) -> wp.Kernel:
-    """A kernel that casts rays and projects `functions` functions on the surface on `count` functions of direction."""
+def make_gathering(functions: int, count: int) -> SimpleNamespace:
+    """Kernels that project `functions` functions on the surface, as rays meet them, on `count` functions of direction.
+
+    gather_functions casts the rays, sum_hits knows what they meet.
+    """
 
     @wp.func_native(_add_products_snippet(functions, count))
     def add_products(
@@ -52,7 +57,27 @@ def make_gathering(functions: int, count: int) -> wp.Kernel:
                     add_products(basis, faces, hit.face, hit.u, hit.v, weighted_basis, ray, sums_out, sample)
         hits_out[sample] = hits
 
-    return gather_functions
+    @wp.kernel(enable_backward=False, module="unique")
+    def sum_hits(
+        first: int,
+        faces: wp.array(dtype=wp.int32),  # (face corner)
+        basis: wp.array(dtype=wp.float32),  # (vertex * function)
+        hit_face: wp.array2d(dtype=wp.int32),  # (sample, ray)
+        hit_place: wp.array2d(dtype=wp.vec2h),  # (sample, ray)
+        weighted_basis: wp.array(dtype=wp.float32),  # (ray * count)
+        sums_out: wp.array(dtype=wp.float32),  # (sample * function * count)
+    ):
+        world, sample = wp.tid()
+        sample += first
+        for ray in range(hit_face.shape[1]):
+            face = hit_face[sample, ray]
+            if face >= 0:
+                place = hit_place[sample, ray]
+                add_products(
+                    basis, faces, face, float(place[0]), float(place[1]), weighted_basis, ray, sums_out, sample
+                )
+
+    return SimpleNamespace(gather_functions=gather_functions, sum_hits=sum_hits)
 
 
 def _add_products_snippet(functions: int, count: int) -> str:
@@ -69,6 +94,27 @@ def _add_products_snippet(functions: int, count: int) -> str:
     for (int i = 0; i < {functions}; ++i)
         for (int k = 0; k < {count}; ++k) sum[i * {count} + k] += values[i] * factors[k];
     """
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _find_hits(
+    first: int,
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),  # (sample)
+    frames: wp.array(dtype=wp.mat33),  # (sample)
+    reach: float,
+    rays: wp.array(dtype=wp.vec3),  # (ray), about +z
+    face_out: wp.array2d(dtype=wp.int32),  # (sample, ray)
+    place_out: wp.array2d(dtype=wp.vec2h),  # (sample, ray)
+):
+    world, sample = wp.tid()
+    sample += first
+    for ray in range(rays.shape[0]):
+        hit = wp.mesh_query_ray(mesh, points[sample], frames[sample] * rays[ray], reach)
+        face_out[sample, ray] = -1
+        if hit.result and hit.sign > 0.0:
+            face_out[sample, ray] = hit.face
+            place_out[sample, ray] = wp.vec2h(wp.float16(hit.u), wp.float16(hit.v))
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -140,8 +186,52 @@ def gather_functions(
         wp.array(rays, dtype=wp.vec3, device=device),
         wp.array(weighted_basis.ravel(), dtype=wp.float32, device=device),
     ]
-    launch(make_gathering(functions, count), (1, len(points)), inputs, [sums, hits], device)
+    launch(make_gathering(functions, count).gather_functions, (1, len(points)), inputs, [sums, hits], device)
     return sums.numpy().reshape(-1, functions, count), hits.numpy().astype(np.float32) / len(rays)
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Which fronts of a mesh rays from points meet, on the device.
+
+    mesh: the mesh; face: wp.array2d (point, ray) of int32, -1 where none is met; place: wp.array2d (point, ray) of
+    vec2h, the first two barycentric coordinates.
+    """
+
+    mesh: wp.Mesh
+    face: wp.array
+    place: wp.array
+
+
+def find_hits(mesh: wp.Mesh, points: np.ndarray, axes: np.ndarray, rays: np.ndarray, device: wp.Device) -> Hits:
+    """What rays [Q, 3], given about +z, meet from points [n, 3] when they are turned about the axes [n, 3]."""
+    shape = (len(points), len(rays))
+    face = wp.empty(shape, dtype=wp.int32, device=device)
+    place = wp.empty(shape, dtype=wp.vec2h, device=device)
+    inputs = [
+        mesh.id,
+        wp.array(points, dtype=wp.vec3, device=device),
+        wp.array(sphere.frame(axes), dtype=wp.mat33, device=device),
+        4.0 * float(np.abs(points).max(initial=0.0) + np.abs(mesh.points.numpy()).max()),
+        wp.array(rays, dtype=wp.vec3, device=device),
+    ]
+    launch(_find_hits, (1, len(points)), inputs, [face, place], device)
+    return Hits(mesh, face, place)
+
+
+def sum_hits(hits: Hits, basis: np.ndarray, device: wp.Device) -> np.ndarray:
+    """The sum over a point's rays of the functions at what they meet; basis: float32 [vertices, N]; float32 [n, N]."""
+    functions, (points, rays) = basis.shape[1], hits.face.shape
+    sums = wp.zeros(points * functions, dtype=wp.float32, device=device)
+    inputs = [
+        hits.mesh.indices,
+        wp.array(basis.ravel(), dtype=wp.float32, device=device),
+        hits.face,
+        hits.place,
+        wp.array(np.ones(rays), dtype=wp.float32, device=device),
+    ]
+    launch(make_gathering(functions, 1).sum_hits, (1, points), inputs, [sums], device)
+    return sums.numpy().reshape(points, functions)
 
 
 def light_surface(

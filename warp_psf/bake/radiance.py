@@ -9,7 +9,7 @@ serves every colour.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -17,15 +17,15 @@ import warp as wp
 from warp_psf.bake import gather, visibility
 from warp_psf.bake.adapt import reduce_shell
 from warp_psf.bake.body import (
-    InnerShell,
     Progress,
     can_be_read,
     check_settings,
     cone_of_shell,
-    sample_inner_shell,
+    sample_shells,
     upload_mesh,
 )
 from warp_psf.bake.kept import load_radiance, save_radiance
+from warp_psf.bake.shape import shape_key, unit_shape
 from warp_psf.bake.transfer import VERTEX_OFFSET
 from warp_psf.basis import sh, sphere
 from warp_psf.device import find_device
@@ -35,13 +35,12 @@ from warp_psf.field.radiance import (
     RADIANCE_SHELLS,
     BasisRadianceField,
 )
-from warp_psf.field.shells import FIRST_OUTER_SHELL, quantise, sample_directions, shell_radii
-from warp_psf.field.store import store_key
+from warp_psf.field.shells import FIRST_OUTER_SHELL, quantise
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.topology import area_vectors
 
 # Raised whenever the same settings would give other numbers, so that older files on disk are not used.
-RADIANCE_VERSION = 5
+RADIANCE_VERSION = 6
 # Of Equation 1, for the worst function of a shell. Twice that saves a quarter of the bytes and makes the light of a
 # tenpin or a teapot beyond 2 radii 1 to 2 % too weak.
 RADIANCE_THRESHOLD = 0.01
@@ -149,32 +148,42 @@ def bake_radiance(
     report = progress or (lambda share: None)
     settings = {"bake": RADIANCE_VERSION, "kind": "basis radiance", "order": order, "functions": functions}
     settings |= {"threshold": threshold, "convex": mesh.convex, "closed": mesh.closed}
-    key = store_key(settings, mesh.vertices, mesh.faces, mesh.normals)
-    areas, features = _vertex_areas(mesh), _features(mesh)
-    kept = load_radiance(key, mesh, order, functions) if use_cache else None
+    unit = unit_shape(mesh)
+    key = shape_key(settings, unit)
+    areas, features = _vertex_areas(unit), _features(unit)
+    kept = load_radiance(key, unit, order, functions) if use_cache else None
     if kept is None:
         on_device = find_device(device)
-        warp_mesh = upload_mesh(mesh, on_device)
-        basis, buried = _find_functions(mesh, warp_mesh, areas, features, functions, on_device)
+        warp_mesh = upload_mesh(unit, on_device)
+        sight = _look_at_itself(unit, warp_mesh, on_device)
+        basis, buried = _find_functions(unit, warp_mesh, areas, features, functions, sight, on_device)
         open_vertices = np.flatnonzero(~buried)
         proxies = open_vertices[_farthest_points(features[open_vertices], MOST_PROXIES)].astype(np.int32)
         report(0.1)
-        self_irradiance = None if mesh.convex else _gather_on_itself(mesh, warp_mesh, basis, on_device)
+        self_irradiance = sight and _gather_on_itself(sight, basis, on_device)
         report(0.2)
         # The last step is reported once the result is kept.
         shells = _bake_field(
-            mesh, warp_mesh, basis, order, threshold, on_device, lambda share: report(0.2 + 0.79 * share)
+            unit, warp_mesh, basis, order, threshold, on_device, lambda share: report(0.2 + 0.79 * share)
         )
         kept = basis, proxies, self_irradiance, shells
         if use_cache:
-            save_radiance(key, *kept)
+            save_radiance(key, unit, *kept)
     basis, proxies, self_irradiance, shells = kept
     report(1.0)
-    return BakedRadiance(basis, areas, proxies, shells, self_irradiance, features)
+    field = replace(shells, center=mesh.center.astype(np.float32), radius=float(mesh.radius))
+    areas = (areas * mesh.radius**2).astype(np.float32)
+    return BakedRadiance(basis, areas, proxies, field, self_irradiance, features)
 
 
 def _find_functions(
-    mesh: Mesh, warp_mesh: wp.Mesh, areas: np.ndarray, features: np.ndarray, functions: int, device: wp.Device
+    mesh: Mesh,
+    warp_mesh: wp.Mesh,
+    areas: np.ndarray,
+    features: np.ndarray,
+    functions: int,
+    sight: gather.Hits | None,
+    device: wp.Device,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The basis functions [vertices, N], and which vertices lie buried in the solid, bool [vertices]."""
     points = _off_surface(mesh)
@@ -209,14 +218,14 @@ def _find_functions(
             inner *= math.sqrt(squares[0] / squares[1])
         light = np.concatenate([light, inner], axis=1)
     basis = _principal_components(light, areas, functions)
-    if not mesh.convex:
+    if sight is not None:
         level = np.average(light.mean(axis=1), weights=areas)
-        echoes = level * _echoes(mesh, warp_mesh, basis, device)
+        echoes = level * _echoes(sight, basis, device)
         basis = _principal_components(light, areas, functions, echoes)
     return basis, buried
 
 
-def _echoes(mesh: Mesh, warp_mesh: wp.Mesh, basis: np.ndarray, device: wp.Device) -> np.ndarray:
+def _echoes(sight: gather.Hits, basis: np.ndarray, device: wp.Device) -> np.ndarray:
     """What a white body makes of the light of its functions by reflecting it to itself, once, twice, ... [vertices, k].
 
     The light in a cavity after some bounces is unlike any that comes from outside. It is represented only when the
@@ -224,7 +233,7 @@ def _echoes(mesh: Mesh, warp_mesh: wp.Mesh, basis: np.ndarray, device: wp.Device
     """
     columns, function = [], basis
     for _ in range(ECHOES):
-        function = _gather_on_itself(mesh, warp_mesh, function, device) / math.pi
+        function = _gather_on_itself(sight, function, device) / math.pi
         columns.append(function)
     return ECHO_GAIN * math.sqrt(LIGHTS / basis.shape[1]) * np.concatenate(columns, axis=1)
 
@@ -265,16 +274,21 @@ def _principal_components(
     return basis.astype(np.float32)
 
 
-def _gather_on_itself(mesh: Mesh, warp_mesh: wp.Mesh, basis: np.ndarray, device: wp.Device) -> np.ndarray:
-    """The irradiance at each vertex from the functions on the body itself, float32 [vertices, N]."""
+def _look_at_itself(mesh: Mesh, warp_mesh: wp.Mesh, device: wp.Device) -> gather.Hits | None:
+    """What each vertex sees of the body itself; None of a convex body, which sees nothing."""
+    if mesh.convex:
+        return None
     # Equal areas of the disc below the hemisphere, raised to it: a density in proportion to the cosine.
     sine_squared = (np.arange(SELF_RAYS) + 0.5) / SELF_RAYS
     phi = math.pi * (3 - math.sqrt(5)) * np.arange(SELF_RAYS)
     sine = np.sqrt(sine_squared)
     rays = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.sqrt(1 - sine_squared)], axis=1)
-    weights = np.full((SELF_RAYS, 1), math.pi / SELF_RAYS)
-    sums, _ = gather.gather_functions(warp_mesh, basis, _off_surface(mesh), mesh.normals, rays, weights, device)
-    return sums[:, :, 0]
+    return gather.find_hits(warp_mesh, _off_surface(mesh), mesh.normals, rays, device)
+
+
+def _gather_on_itself(sight: gather.Hits, basis: np.ndarray, device: wp.Device) -> np.ndarray:
+    """The irradiance at each vertex from the functions on the body itself, float32 [vertices, N]."""
+    return gather.sum_hits(sight, basis, device) * np.float32(math.pi / SELF_RAYS)
 
 
 def _bake_field(
@@ -288,29 +302,18 @@ def _bake_field(
 ) -> BasisRadianceField:
     """Samples every shell, reduces each of them for all functions together, and quantises it."""
     resolution, functions = FINEST_RADIANCE_RESOLUTION, basis.shape[1]
-    outward = sample_directions(resolution).reshape(-1, 3)
-    inner: list[InnerShell] = []
-    for shell in reversed(range(FIRST_OUTER_SHELL + 1)):
 
-        def project(points: np.ndarray, outward: np.ndarray, shell: int = shell) -> np.ndarray:
-            return _project(warp_mesh, basis, shell, points, outward, order, device)
+    def project(shell: int, points: np.ndarray, outward: np.ndarray) -> np.ndarray:
+        return _project(warp_mesh, basis, shell, points, outward, order, device)
 
-        inner.insert(0, sample_inner_shell(mesh, warp_mesh, shell, resolution, project, device, inner[:1]))
-        report(len(inner) / RADIANCE_SHELLS)
-    vectors, inside = [samples.vectors for samples in inner], [samples.inside for samples in inner]
-    for shell in range(FIRST_OUTER_SHELL + 1, RADIANCE_SHELLS):
-        points = (mesh.center + shell_radii(mesh.radius)[shell] * outward).astype(np.float32)
-        vectors.append(_project(warp_mesh, basis, shell, points, outward, order, device))
-        inside.append(np.zeros(len(points), bool))
-        report(len(vectors) / RADIANCE_SHELLS)
-    inside = [within.reshape(resolution, resolution) for within in inside]
-    shells = [values[:, :-1].reshape(resolution, resolution, functions, -1) for values in vectors]
+    vectors, inside = sample_shells(mesh, warp_mesh, RADIANCE_SHELLS, resolution, project, device, report)
+    shells = [values[:, :, :-1].reshape(resolution, resolution, functions, -1) for values in vectors]
     if threshold is not None:
         shells = [reduce_shell(values, threshold, can_be_read(inside, shell)) for shell, values in enumerate(shells)]
     shells[FIRST_OUTER_SHELL:] = [_sharpen(values) for values in shells[FIRST_OUTER_SHELL:]]
     kept = quantise(mesh.center, mesh.radius, [values.reshape(*values.shape[:2], -1) for values in shells])
     left = kept.resolutions[FIRST_OUTER_SHELL]
-    covered = vectors[FIRST_OUTER_SHELL][:, -1].reshape(left, resolution // left, left, -1).mean(axis=(1, 3))
+    covered = vectors[FIRST_OUTER_SHELL][:, :, -1].reshape(left, resolution // left, left, -1).mean(axis=(1, 3))
     return BasisRadianceField(
         center=kept.center,
         radius=kept.radius,

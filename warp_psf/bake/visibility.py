@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from warp_psf.bake.bundles import RayBundles, agrees, cap_bundles
 from warp_psf.basis import sh, sphere
 from warp_psf.device import launch
 
@@ -31,6 +32,21 @@ SURFACE_OFFSET = 1.0e-4
 MOST_LAYERS = 32
 # A vector is rotated through its values at a quadrature's directions: exact for twice the highest degree.
 ROTATION_POINTS = {2: 16, 3: 16, 4: 32, 5: 32, 6: 64}
+
+
+@wp.func
+def cast_probes(
+    mesh: wp.uint64,
+    point: wp.vec3,
+    frame: wp.mat33,
+    reach: float,
+    bundles: RayBundles,
+    probed: wp.array(dtype=wp.uint8),  # (bundle), written
+):
+    """Casts the probe of each bundle."""
+    for bundle in range(probed.shape[0]):
+        hit = wp.mesh_query_ray_anyhit(mesh, point, frame * bundles.rays[bundles.first[bundle]], reach)
+        probed[bundle] = wp.where(hit, wp.uint8(1), wp.uint8(0))
 
 
 @cache
@@ -58,21 +74,33 @@ def make_visibility(order: int) -> SimpleNamespace:
         first: int,
         mesh: wp.uint64,
         points: wp.array(dtype=wp.vec3),  # (sample)
-        axes: wp.array(dtype=wp.vec3),  # (sample): axis of the cone of rays
+        axes: wp.array(dtype=wp.vec3),  # (sample)
         reach: float,
-        rays: wp.array(dtype=wp.vec3),  # (ray), about +z
-        weighted_basis: wp.array(dtype=vec),  # (ray): basis times solid angle of the ray
+        bundles: RayBundles,
+        weighted_basis: wp.array(dtype=vec),  # (ray)
+        bundle_basis: wp.array(dtype=vec),  # (bundle): its rays' sum of that
         directions: wp.array(dtype=wp.vec3),  # (quadrature)
         direction_basis: wp.array(dtype=vec),  # (quadrature)
+        probed_out: wp.array2d(dtype=wp.uint8),  # (sample, bundle): whether its probe hits
         coverage_out: wp.array(dtype=vec),  # (sample)
     ):
         world, sample = wp.tid()
         sample += first
+        point = points[sample]
         frame = sphere.frame_of(axes[sample])
+        cast_probes(mesh, point, frame, reach, bundles, probed_out[sample])
         covered = vec()
-        for ray in range(rays.shape[0]):
-            if wp.mesh_query_ray_anyhit(mesh, points[sample], frame * rays[ray], reach):
-                covered += weighted_basis[ray]
+        for bundle in range(bundle_basis.shape[0]):
+            hit = probed_out[sample, bundle] != wp.uint8(0)
+            if agrees(bundles, probed_out[sample], bundle):
+                if hit:
+                    covered += bundle_basis[bundle]
+            else:
+                if hit:
+                    covered += weighted_basis[bundles.first[bundle]]
+                for ray in range(bundles.first[bundle] + 1, bundles.first[bundle + 1]):
+                    if wp.mesh_query_ray_anyhit(mesh, point, frame * bundles.rays[ray], reach):
+                        covered += weighted_basis[ray]
         coverage_out[sample] = turn(covered, frame, directions, direction_basis)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -106,22 +134,31 @@ def make_visibility(order: int) -> SimpleNamespace:
         points: wp.array(dtype=wp.vec3),  # (vertex)
         normals: wp.array(dtype=wp.vec3),  # (vertex)
         reach: float,
-        rays: wp.array(dtype=wp.vec3),  # (ray), the hemisphere about +z
+        bundles: RayBundles,  # the hemisphere about +z
         weighted_basis: wp.array(dtype=vec),  # (ray)
         directions: wp.array(dtype=wp.vec3),  # (quadrature)
         direction_basis: wp.array(dtype=vec),  # (quadrature)
+        probed_out: wp.array2d(dtype=wp.uint8),  # (vertex, bundle)
         blocked_out: wp.array(dtype=vec),  # (vertex)
         blocked_cosine_out: wp.array(dtype=vec),  # (vertex)
     ):
         world, vertex = wp.tid()
         vertex += first
+        point = points[vertex]
         frame = sphere.frame_of(normals[vertex])
+        cast_probes(mesh, point, frame, reach, bundles, probed_out[vertex])
         blocked = vec()
         blocked_cosine = vec()
-        for ray in range(rays.shape[0]):
-            if wp.mesh_query_ray_anyhit(mesh, points[vertex], frame * rays[ray], reach):
-                blocked += weighted_basis[ray]
-                blocked_cosine += rays[ray][2] * weighted_basis[ray]
+        for bundle in range(probed_out.shape[1]):
+            hit = probed_out[vertex, bundle] != wp.uint8(0)
+            same = agrees(bundles, probed_out[vertex], bundle)
+            if hit or not same:
+                for ray in range(bundles.first[bundle], bundles.first[bundle + 1]):
+                    if ray > bundles.first[bundle] and not same:
+                        hit = wp.mesh_query_ray_anyhit(mesh, point, frame * bundles.rays[ray], reach)
+                    if hit:
+                        blocked += weighted_basis[ray]
+                        blocked_cosine += bundles.rays[ray][2] * weighted_basis[ray]
         blocked_out[vertex] = turn(blocked, frame, directions, direction_basis)
         blocked_cosine_out[vertex] = turn(blocked_cosine, frame, directions, direction_basis)
 
@@ -139,7 +176,10 @@ def is_inside(
 ) -> bool:
     """Whether at least `least_share` of the rays from a point leave more layers of solid than they enter."""
     leaving = wp.int32(0)
-    for ray in range(rays.shape[0]):
+    needed = least_share * float(rays.shape[0])
+    ray = wp.int32(0)
+    # No further than until enough leave, or too few are left for that.
+    while ray < rays.shape[0] and float(leaving) < needed and float(leaving + rays.shape[0] - ray) >= needed:
         walk = point
         left = wp.int32(0)
         crossed = wp.int32(0)
@@ -152,7 +192,8 @@ def is_inside(
             else:
                 crossed = MOST_LAYERS
         leaving += wp.where(left > 0, 1, 0)
-    return float(leaving) >= least_share * float(rays.shape[0])
+        ray += 1
+    return float(leaving) >= needed
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -218,54 +259,65 @@ def project_coverage(
     order: int,
     device: wp.Device,
     face_radiance: np.ndarray | None = None,
+    *,
+    solid: bool = False,
 ) -> np.ndarray:
     """Coverage of the directions around points, projected on SH; float32 [N, order^2].
 
     points: float32 [N, 3] in the body's frame, metres; axes: unit vectors [N, 3], the axes of the cones of rays;
     half_angle: of the cones, radians; face_radiance: float [faces], if given, weights each covered direction with the
-    radiance of the face seen there (front faces only).
+    radiance of the face seen there (front faces only). solid: whether the body has no sheets, so that rays may be left
+    out between those that agree (see `bundles`).
     """
     kit = make_visibility(order)
-    local = sphere.fibonacci_cap(ray_count, half_angle)
-    ray_solid_angle = 2 * math.pi * (1 - math.cos(half_angle)) / ray_count
+    bundles = cap_bundles(ray_count, half_angle, solid)
+    weighted = sh.evaluate(bundles.rays, order) * (2 * math.pi * (1 - math.cos(half_angle)) / ray_count)
     out = wp.zeros(len(points), dtype=kit.vec, device=device)
     reach = 4.0 * float(np.abs(points).max(initial=0.0) + np.abs(mesh.points.numpy()).max())
-    inputs = [
-        wp.array(points, dtype=wp.vec3, device=device),
-        wp.array(axes, dtype=wp.vec3, device=device),
-        reach,
-        wp.array(local, dtype=wp.vec3, device=device),
-        wp.array(sh.evaluate(local, order) * ray_solid_angle, dtype=kit.vec, device=device),
-        *_rotation_tables(order, device),
-    ]
+    samples = [wp.array(points, dtype=wp.vec3, device=device), wp.array(axes, dtype=wp.vec3, device=device), reach]
+    rays, weights = bundles.upload(device), wp.array(weighted, dtype=kit.vec, device=device)
+    tables = _rotation_tables(order, device)
     if face_radiance is None:
-        launch(kit.project_coverage, (1, len(points)), [mesh.id, *inputs], [out], device)
+        bundle_basis = wp.array(np.add.reduceat(weighted, bundles.first[:-1]), dtype=kit.vec, device=device)
+        probed = wp.empty((len(points), len(bundle_basis)), dtype=wp.uint8, device=device)
+        inputs = [mesh.id, *samples, rays, weights, bundle_basis, *tables]
+        launch(kit.project_coverage, (1, len(points)), inputs, [probed, out], device)
     else:
         radiance = wp.array(face_radiance, dtype=wp.float32, device=device)
-        launch(kit.project_radiance, (1, len(points)), [mesh.id, radiance, *inputs], [out], device)
+        inputs = [mesh.id, radiance, *samples, rays.rays, weights, *tables]
+        launch(kit.project_radiance, (1, len(points)), inputs, [out], device)
     return out.numpy()
 
 
 def project_blocked_hemisphere(
-    mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, ray_count: int, order: int, device: wp.Device
+    mesh: wp.Mesh,
+    points: np.ndarray,
+    normals: np.ndarray,
+    ray_count: int,
+    order: int,
+    device: wp.Device,
+    *,
+    solid: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the body hides of the hemispheres about `normals` at `points` [N, 3] of its surface.
 
+    solid: as in `project_coverage`.
     Returns two float32 [N, order^2]: the blocked part projected alone, and projected together with the cosine.
     """
     kit = make_visibility(order)
-    local = sphere.fibonacci_cap(ray_count, math.pi / 2)
+    bundles = cap_bundles(ray_count, math.pi / 2, solid)
     outs = [wp.zeros(len(points), dtype=kit.vec, device=device) for _ in range(2)]
     inputs = [
         mesh.id,
         wp.array(points, dtype=wp.vec3, device=device),
         wp.array(normals, dtype=wp.vec3, device=device),
         4.0 * float(np.abs(points).max()),
-        wp.array(local, dtype=wp.vec3, device=device),
-        wp.array(sh.evaluate(local, order) * (2 * math.pi / ray_count), dtype=kit.vec, device=device),
+        bundles.upload(device),
+        wp.array(sh.evaluate(bundles.rays, order) * (2 * math.pi / ray_count), dtype=kit.vec, device=device),
         *_rotation_tables(order, device),
     ]
-    launch(kit.project_blocked_hemisphere, (1, len(points)), inputs, outs, device)
+    probed = wp.empty((len(points), len(bundles.beside)), dtype=wp.uint8, device=device)
+    launch(kit.project_blocked_hemisphere, (1, len(points)), inputs, [probed, *outs], device)
     return outs[0].numpy(), outs[1].numpy()
 
 
