@@ -16,8 +16,10 @@ from warp_psf.bridge import (
     looks,
     read_camera,
     read_delta_lights,
+    read_image_lights,
     read_loose,
     read_poses,
+    read_skybox,
 )
 from warp_psf.device import find_device
 from warp_psf.field.radiance import FUNCTION_COUNTS
@@ -50,7 +52,8 @@ class Renderer:
         of the picture, pixels.
     max_geom: how many geoms `scene` has room for.
     environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
-        HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none.
+        HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none. A model's lights of
+        type `image` add theirs; its skybox, if it has one, is seen in the background, and lights nothing.
     lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
     bounces: how often light is passed on between the bodies, 0 to 16; 0 leaves only direct light.
     bounce_threshold: a body that takes up a smaller share of a point's view than this sends it no bounced light.
@@ -111,6 +114,7 @@ class Renderer:
         self._exposure, self._view = exposure, view
         self._environment = load_environment(environment)
         self._material_space, self._lights, self._model_lights = material_space, lights, model_lights
+        self._skybox = read_skybox(model, material_space)
         self._progress = progress or (lambda what, share: None)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(model, max_geom)
@@ -286,7 +290,11 @@ class Renderer:
             model_lights=self._model_lights,
             loose=room,
         )
-        return set_stage(scene, self._environment, self._settings, room, self._progress)
+        environments = [] if self._environment is None else [self._environment]
+        if self._model_lights:
+            environments += read_image_lights(self._model, self._material_space)
+        background = self._skybox or next(iter(environments), None)
+        return set_stage(scene, environments, background, self._settings, room, self._progress)
 
     def _draw(self) -> Stage:
         """The stage with the layers of the present state."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -93,10 +93,16 @@ class Stage:
 
 
 def set_stage(
-    scene: Scene, environment: Environment | None, settings: Settings, room: LooseRoom | None, progress: Progress
+    scene: Scene,
+    environments: Sequence[Environment],
+    background: Environment | None,
+    settings: Settings,
+    room: LooseRoom | None,
+    progress: Progress,
 ) -> Stage:
     """Bakes what a scene needs, or reads it from the cache, and puts it on the device.
 
+    environments: their light adds up. background: what is seen behind everything; None is black.
     progress: called as progress(what, share) while something is baked.
     """
     if settings.shading == "vertex":
@@ -116,10 +122,9 @@ def set_stage(
     transfers = _transfers(bodies)
     shining = [(entity, light.radiance) for light, entity in area_lights]
     lighting = upload_lighting(scene, transfers, shining, order, 1, device)
-    background = np.zeros((1, 1, 3), np.float32)
-    if environment is not None:
-        write_environment(lighting, environment.project(order))
-        background = environment.radiance
+    if environments:
+        write_environment(lighting, np.sum([each.project(order) for each in environments], axis=0))
+    behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
 
     size = settings.width, settings.height
     see_through = any(entity.opacity < 1.0 for entity in scene.entities)
@@ -148,7 +153,7 @@ def set_stage(
         lighting=lighting,
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
         surfaces=surfaces,
-        film=make_film(1, *size, background, device),
+        film=make_film(1, *size, behind, device),
         lattice=make_lattice(1, surfaces.slots, *size, device),
         received=make_received(surfaces.slots, device),
         bounced=make_received(surfaces.slots, device),

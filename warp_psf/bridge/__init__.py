@@ -6,6 +6,7 @@ from warp_psf.bridge.lights import read_delta_lights
 from warp_psf.bridge.loose import read_loose
 from warp_psf.bridge.model import check_data, load_model, simulate
 from warp_psf.bridge.shown import looks
+from warp_psf.bridge.sky import read_image_lights, read_skybox
 
 __all__ = [
     "build_scene",
@@ -15,7 +16,9 @@ __all__ = [
     "looks",
     "read_camera",
     "read_delta_lights",
+    "read_image_lights",
     "read_loose",
     "read_poses",
+    "read_skybox",
     "simulate",
 ]

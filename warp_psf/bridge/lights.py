@@ -54,7 +54,7 @@ def model_lights_of(model: mujoco.MjModel) -> list[DeltaLight]:
     mujoco.mj_camlight(model, data)
     lights = []
     for index in range(model.nlight):
-        kind = light_kind(model, index)
+        kind = _light_kind(model, index)
         if kind is None:
             continue
         place = {"position": data.light_xpos[index], "direction": data.light_xdir[index]}
@@ -91,7 +91,8 @@ def _light_colors(diffuse, specular, ambient) -> dict[str, np.ndarray]:
     return {"diffuse": np.maximum(diffuse, 0), "specular": np.maximum(specular, 0), "ambient": np.maximum(ambient, 0)}
 
 
-def light_kind(model: mujoco.MjModel, index: int) -> Literal["directional", "spot", "point"] | None:
+def _light_kind(model: mujoco.MjModel, index: int) -> Literal["directional", "spot", "point"] | None:
+    """The kind of delta light; None for an image light, which is an environment."""
     if not hasattr(model, "light_type"):
         # The first MuJoCo 3.3 tells two kinds apart.
         return "directional" if model.light_directional[index] else "spot"

@@ -30,8 +30,9 @@ def make_mapping(
     shape, repeat = _unit_size(GEOM(kind), size), np.array(model.mat_texrepeat[material], np.float64)
     uniform = bool(model.mat_texuniform[material])
     if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
-        wrap = Wrap.CUBE_CAPSULE if kind == GEOM.mjGEOM_CAPSULE else Wrap.CUBE
-        stretch = _drawn_size(GEOM(kind), size) if uniform else np.ones(3)
+        wrap, drawn = Wrap.CUBE_CAPSULE if kind == GEOM.mjGEOM_CAPSULE else Wrap.CUBE, _drawn_size(GEOM(kind), size)
+        # Endless planes have no size to be uniform over.
+        stretch = np.where(uniform & (drawn > 0.0), drawn, 1.0)
         return Mapping(wrap, size=_triple(shape), stretch=_triple(stretch))
     drawn = _drawn_size(GEOM(kind), size)[:2]
     if (kind in MESHES and model.mesh_texcoordadr[data_id] < 0) or kind == GEOM.mjGEOM_HFIELD:

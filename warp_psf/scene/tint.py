@@ -39,15 +39,79 @@ class TextureTable:
 
 
 @wp.func
+def cube_side(d: wp.vec3) -> int:
+    """The side of a cube map that a direction falls on."""
+    x = wp.abs(d[0])
+    y = wp.abs(d[1])
+    z = wp.abs(d[2])
+    if x >= y and x >= z:
+        return wp.where(d[0] < 0.0, 1, 0)
+    if y >= z:
+        return wp.where(d[1] < 0.0, 3, 2)
+    return wp.where(d[2] < 0.0, 5, 4)
+
+
+@wp.func
+def on_side(d: wp.vec3, side: int) -> wp.vec2:
+    """Where a direction meets the plane of a side, in the side's coordinates."""
+    across = d[0]
+    down = -d[1]
+    major = wp.abs(d[2])
+    if side == 0:
+        across = -d[2]
+        major = wp.abs(d[0])
+    elif side == 1:
+        across = d[2]
+        major = wp.abs(d[0])
+    elif side == 2:
+        down = d[2]
+        major = wp.abs(d[1])
+    elif side == 3:
+        down = -d[2]
+        major = wp.abs(d[1])
+    elif side == 5:
+        across = -d[0]
+    major = wp.max(major, 1.0e-12)
+    return wp.vec2(0.5 * (across / major + 1.0), 0.5 * (down / major + 1.0))
+
+
+@wp.func
+def off_side(side: int, s: float, t: float) -> wp.vec3:
+    """The direction of a place on the plane of a side, which may lie beyond the side."""
+    across = 2.0 * s - 1.0
+    down = 2.0 * t - 1.0
+    if side == 0:
+        return wp.vec3(1.0, -down, -across)
+    if side == 1:
+        return wp.vec3(-1.0, -down, across)
+    if side == 2:
+        return wp.vec3(across, 1.0, down)
+    if side == 3:
+        return wp.vec3(across, -1.0, -down)
+    if side == 4:
+        return wp.vec3(across, -down, 1.0)
+    return wp.vec3(-across, -down, -1.0)
+
+
+@wp.func
 def texel(table: TextureTable, level: int, srgb: int, cube: bool, side: int, column: int, row: int) -> wp.vec3:
-    """One linear colour; flat textures repeat, sides of a cube end."""
+    """One linear colour; flat textures repeat, beyond a side of a cube follows its neighbour."""
     extent = table.extent[level]
-    x = wp.clamp(column, 0, extent[0] - 1)
-    y = wp.clamp(row, 0, extent[1] - 1)
+    x = column
+    y = row
+    on = side
     if not cube:
         x = column - int(wp.floor(float(column) / float(extent[0]))) * extent[0]
         y = row - int(wp.floor(float(row) / float(extent[1]))) * extent[1]
-    packed = table.texels[table.first_texel[level] + (side * extent[1] + y) * extent[0] + x]
+    elif column < 0 or row < 0 or column >= extent[0] or row >= extent[1]:
+        s = (float(column) + 0.5) / float(extent[0])
+        t = (float(row) + 0.5) / float(extent[1])
+        d = off_side(side, s, t)
+        on = cube_side(d)
+        place = on_side(d, on)
+        x = wp.clamp(int(place[0] * float(extent[0])), 0, extent[0] - 1)
+        y = wp.clamp(int(place[1] * float(extent[1])), 0, extent[1] - 1)
+    packed = table.texels[table.first_texel[level] + (on * extent[1] + y) * extent[0] + x]
     return wp.vec3(
         table.decoded[srgb, int(packed & wp.uint32(255))],
         table.decoded[srgb, int((packed >> wp.uint32(8)) & wp.uint32(255))],
@@ -111,43 +175,6 @@ def filtered(
 
 
 @wp.func
-def cube_side(d: wp.vec3) -> int:
-    """The side of a cube map that a direction falls on."""
-    x = wp.abs(d[0])
-    y = wp.abs(d[1])
-    z = wp.abs(d[2])
-    if x >= y and x >= z:
-        return wp.where(d[0] < 0.0, 1, 0)
-    if y >= z:
-        return wp.where(d[1] < 0.0, 3, 2)
-    return wp.where(d[2] < 0.0, 5, 4)
-
-
-@wp.func
-def on_side(d: wp.vec3, side: int) -> wp.vec2:
-    """Where a direction meets the plane of a side, in the side's coordinates."""
-    across = d[0]
-    down = -d[1]
-    major = wp.abs(d[2])
-    if side == 0:
-        across = -d[2]
-        major = wp.abs(d[0])
-    elif side == 1:
-        across = d[2]
-        major = wp.abs(d[0])
-    elif side == 2:
-        down = d[2]
-        major = wp.abs(d[1])
-    elif side == 3:
-        down = -d[2]
-        major = wp.abs(d[1])
-    elif side == 5:
-        across = -d[0]
-    major = wp.max(major, 1.0e-12)
-    return wp.vec2(0.5 * (across / major + 1.0), 0.5 * (down / major + 1.0))
-
-
-@wp.func
 def longitude(q: wp.vec3) -> float:
     """The share of a full turn around z, from x, in [0, 1)."""
     turn = wp.atan2(q[1], q[0]) * wp.static(0.5 / math.pi)
@@ -155,8 +182,12 @@ def longitude(q: wp.vec3) -> float:
 
 
 @wp.func
-def place_on_shape(wrap: int, p: wp.vec3, n: wp.vec3, size: wp.vec3) -> wp.vec2:
-    """The coordinates of a point p of a shape, with normal n there, before scale and offset (MuJoCo's own mapping)."""
+def place_on_shape(wrap: int, p: wp.vec3, near: wp.vec3, n: wp.vec3, size: wp.vec3) -> wp.vec2:
+    """The coordinates of a point p of a shape, before scale and offset (MuJoCo's own mapping).
+
+    near, n: a point of the shape beside p and the normal there; they choose the piece of the shape whose formula holds,
+    so that steps of coordinates end at no seam between pieces.
+    """
     if wrap == wp.static(int(Wrap.FLAT)):
         return wp.vec2(p[0], p[1])
     q = wp.cw_div(p, size)
@@ -164,7 +195,7 @@ def place_on_shape(wrap: int, p: wp.vec3, n: wp.vec3, size: wp.vec3) -> wp.vec2:
         height = wp.clamp(q[2] / wp.max(wp.length(q), 1.0e-12), -1.0, 1.0)
         return wp.vec2(longitude(q), 0.5 - wp.asin(height) * wp.static(1.0 / math.pi))
     if wrap == wp.static(int(Wrap.BOX)):
-        along = wp.cw_mul(wp.vec3(wp.abs(n[0]), wp.abs(n[1]), wp.abs(n[2])), wp.vec3(1.0, 1.0, 1.0))
+        along = wp.vec3(wp.abs(n[0]), wp.abs(n[1]), wp.abs(n[2]))
         s = 0.5 * (q[0] + 1.0)
         t = 0.5 * (1.0 - q[2])
         if along[2] >= along[0] and along[2] >= along[1]:
@@ -172,10 +203,10 @@ def place_on_shape(wrap: int, p: wp.vec3, n: wp.vec3, size: wp.vec3) -> wp.vec2:
         elif along[0] >= along[1]:
             s = 0.5 * (q[1] + 1.0)
         return wp.vec2(s, t)
-    over = wp.abs(p[2]) - size[2]
-    if wrap == wp.static(int(Wrap.CAPSULE)) and over > 0.0:
-        latitude = wp.asin(wp.clamp(over / size[0], 0.0, 1.0)) * wp.static(2.0 / math.pi)
-        return wp.vec2(longitude(q), wp.where(p[2] > 0.0, 1.0 - latitude, latitude))
+    if wrap == wp.static(int(Wrap.CAPSULE)) and wp.abs(near[2]) > size[2]:
+        over = wp.where(near[2] > 0.0, p[2], -p[2]) - size[2]
+        latitude = wp.asin(wp.clamp(over / size[0], -1.0, 1.0)) * wp.static(2.0 / math.pi)
+        return wp.vec2(longitude(q), wp.where(near[2] > 0.0, 1.0 - latitude, latitude))
     if wrap == wp.static(int(Wrap.CYLINDER)) and wp.abs(n[2]) > wp.static(END_NORMAL):
         return wp.vec2(0.5 * (q[0] + 1.0), 0.5 * (q[1] + 1.0))
     return wp.vec2(longitude(q), 0.5 * (1.0 - q[2]))
@@ -229,7 +260,7 @@ def tint_of(
     """What the texture of a part multiplies colours with, over the parallelogram of two steps along the surface.
 
     p_entity, n_entity, along_x, along_y: a point of the surface, its normal and the steps, in the entity's frame.
-    face: of the entity's mesh; a negative one is unknown, and coordinates that the mesh brings then count as a mean.
+    face: of the entity's mesh, for coordinates that the mesh brings.
     """
     texture = table.texture[part]
     if texture < 0:
@@ -237,16 +268,10 @@ def tint_of(
     wrap = table.wrap[part]
     scale = table.scale[part]
     if wrap == wp.static(int(Wrap.GIVEN)):
-        place = wp.vec2()
-        # Steps of a whole image: its mean.
-        across = wp.vec2(1.0, 0.0)
-        down = wp.vec2(0.0, 1.0)
-        if face >= 0:
-            place = wp.cw_mul(scale, given_place(table, geometry, entity, face, p_entity)) + table.offset[part]
-            moved = given_place(table, geometry, entity, face, p_entity + along_x)
-            across = wp.cw_mul(scale, moved) + table.offset[part] - place
-            moved = given_place(table, geometry, entity, face, p_entity + along_y)
-            down = wp.cw_mul(scale, moved) + table.offset[part] - place
+        start = given_place(table, geometry, entity, face, p_entity)
+        across = wp.cw_mul(scale, given_place(table, geometry, entity, face, p_entity + along_x) - start)
+        down = wp.cw_mul(scale, given_place(table, geometry, entity, face, p_entity + along_y) - start)
+        place = wp.cw_mul(scale, start) + table.offset[part]
         return filtered(table, texture, False, 0, place, across, down)
     to_part = wp.transpose(table.rotation[part])
     p = to_part * (p_entity - table.position[part])
@@ -262,9 +287,9 @@ def tint_of(
         across = on_side(direction_in_cube(wrap, p + x, size, stretch), side) - place
         down = on_side(direction_in_cube(wrap, p + y, size, stretch), side) - place
         return filtered(table, texture, True, side, place, across, down)
-    place = place_on_shape(wrap, p, n, size)
-    across = place_on_shape(wrap, p + x, n, size) - place
-    down = place_on_shape(wrap, p + y, n, size) - place
+    place = place_on_shape(wrap, p, p, n, size)
+    across = place_on_shape(wrap, p + x, p, n, size) - place
+    down = place_on_shape(wrap, p + y, p, n, size) - place
     if (
         wrap == wp.static(int(Wrap.BALL))
         or wrap == wp.static(int(Wrap.CAPSULE))

@@ -6,6 +6,7 @@ from warp_psf.basis import sphere
 from warp_psf.device import launch
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
 from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.texture import Wrap
 from warp_psf.scene.tint import TextureTable, tint_of
 from warp_psf.shade.bounce import BounceState
 from warp_psf.shade.patches import PatchTable, axis_vector, slab_from_world, texel_center
@@ -47,13 +48,16 @@ def _tint_proxies(
     if entity < 0:
         return
     of_body = proxy < spacing.shape[0]
-    face = int(-1)
-    part = geometry.first_part[entity]
-    if of_body:
-        face = proxies.face[world, proxy]
-        part = part_of(geometry, entity, face)
+    face = proxies.face[world, proxy]
+    part = part_of(geometry, entity, face)
     if textures.texture[part] >= 0:
         to_entity = wp.transpose(poses.rotation[world, entity])
+        p_entity = to_entity * (proxies.position[world, proxy] - poses.position[world, entity])
+        if textures.wrap[part] == wp.static(int(Wrap.GIVEN)):
+            # Texels have no face, and proxies of convex bodies those of a finer mesh.
+            mesh = geometry.mesh_id[geometry.entity_mesh[entity]]
+            found = wp.mesh_query_point_no_sign(mesh, p_entity, geometry.radius[entity])
+            face = wp.where(found.result, found.face, 0)
         frame = sphere.frame_of(proxies.normal[world, proxy])
         across = frame * wp.vec3(1.0, 0.0, 0.0)
         down = frame * wp.vec3(0.0, 1.0, 0.0)
@@ -68,7 +72,7 @@ def _tint_proxies(
             entity,
             part,
             face,
-            to_entity * (proxies.position[world, proxy] - poses.position[world, entity]),
+            p_entity,
             to_entity * proxies.normal[world, proxy],
             to_entity * across,
             to_entity * down,
