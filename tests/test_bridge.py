@@ -415,14 +415,3 @@ def test_unreadable_model(tmp_path, name, content, reason):
         bridge.load_model(path)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_simulation_that_diverges_is_an_error():
-    # A spring far too stiff for its timestep.
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><option timestep=".1" integrator="Euler"/><worldbody><body>
-        <joint type="slide" stiffness="1e9" ref="1"/><geom size=".1"/></body></worldbody></mujoco>"""
-    )
-    with pytest.raises(ValueError, match="diverged"):
-        for _ in zip(range(200), bridge.simulate(model, 10), strict=False):
-            pass

@@ -17,7 +17,7 @@ from tests.mesh_measures import (
     triangles,
     volume,
 )
-from warp_psf.scene.mesh import load_mesh, make_mesh, tessellate
+from warp_psf.scene.mesh import cut_faces, load_mesh, make_mesh, tessellate
 from warp_psf.scene.primitives import box, sphere
 
 
@@ -219,6 +219,19 @@ def test_tessellate(mesh):
     np.testing.assert_allclose(np.linalg.norm(fine.normals, axis=1), 1.0, atol=1e-6)
     assert (fine.slab is mesh.slab, fine.closed, fine.convex) == (True, mesh.closed, mesh.convex)
     assert not fine.vertices.flags.writeable
+
+
+@pytest.mark.parametrize("mesh", [*PRIMITIVES, moved(box((1.0, 0.2, 0.1), cells=1))], ids=lambda mesh: mesh.name)
+def test_pieces_lie_in_the_faces_that_they_come_from(mesh):
+    fine, origin = cut_faces(mesh, mesh.radius / 4.0)
+    whole, piece = (area_vectors(part.vertices.astype(float), part.faces) for part in (mesh, fine))
+    total = np.stack([np.bincount(origin, piece[:, axis], minlength=len(whole)) for axis in range(3)], axis=1)
+    # Pieces of one plane, on the same side: float32 rounding of their corners is all that differs.
+    np.testing.assert_allclose(total, whole, atol=1e-6 * np.ptp(mesh.vertices) ** 2)
+    corner = mesh.vertices[mesh.faces[origin]]
+    low, high = corner.min(axis=1) - 1e-6 * mesh.radius, corner.max(axis=1) + 1e-6 * mesh.radius
+    middle = triangles(fine).mean(axis=1)
+    assert ((middle > low) & (middle < high)).all()
 
 
 def test_tessellated_sphere_keeps_its_flag_while_it_is_one():

@@ -4,7 +4,7 @@ from warp_psf.bridge.cameras import find_camera, read_camera
 from warp_psf.bridge.entities import build_scene, read_poses
 from warp_psf.bridge.lights import read_delta_lights
 from warp_psf.bridge.loose import read_loose
-from warp_psf.bridge.model import check_data, load_model, simulate
+from warp_psf.bridge.model import check_data, load_model
 from warp_psf.bridge.shown import looks
 from warp_psf.bridge.sky import read_image_lights, read_skybox
 
@@ -20,5 +20,4 @@ __all__ = [
     "read_loose",
     "read_poses",
     "read_skybox",
-    "simulate",
 ]

@@ -1,10 +1,8 @@
-"""Models and their simulations: loading, stepping, names, and data that fits its model."""
+"""Models: loading, names, and data that fits its model."""
 
 from __future__ import annotations
 
-import itertools
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -26,32 +24,6 @@ def load_model(path: str | os.PathLike) -> mujoco.MjModel:
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"model {str(path)!r} cannot be loaded: {reason}") from error
-
-
-def simulate(model: mujoco.MjModel, frames_per_second: float) -> Iterator[mujoco.MjData]:
-    """The states of a passive simulation from the model's start, frame after frame without end.
-
-    Yields the same `MjData` every time, stepped on; frame 0 is the start. Simulated time follows the frames' to the
-    nearest step.
-
-    Raises:
-        ValueError: the simulation diverges; MuJoCo starts it anew then, which no film should show.
-    """
-    data = mujoco.MjData(model)
-    steps = 0
-    for frame in itertools.count():
-        target = round(frame / frames_per_second / model.opt.timestep)
-        for _ in range(target - steps):
-            before = data.time
-            mujoco.mj_step(model, data)
-            if data.time <= before:
-                raise ValueError(
-                    f"the simulation diverged at {before:g} s; give the model a shorter timestep or softer contacts"
-                )
-        steps = target
-        # A step leaves the poses of bodies and geoms one step behind the joints.
-        mujoco.mj_forward(model, data)
-        yield data
 
 
 def check_data(model: mujoco.MjModel, data: mujoco.MjData) -> None:

@@ -138,9 +138,17 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
 
 
 def tessellate(mesh: Mesh, longest_edge: float) -> Mesh:
+    """The same surface with edges halved until none is longer than `longest_edge`, metres; see `cut_faces`."""
+    return cut_faces(mesh, longest_edge)[0]
+
+
+def cut_faces(mesh: Mesh, longest_edge: float) -> tuple[Mesh, np.ndarray]:
     """The same surface with edges halved until none is longer than `longest_edge`, metres; normals are interpolated.
 
     A closed mesh stays closed: an edge is cut at one midpoint for all of its faces.
+
+    Returns:
+        The finer mesh, and which face of `mesh` each of its faces is a piece of, integers [F].
 
     Raises:
         ValueError: the length is not positive, or so short that more than `MOST_FACES` faces would result.
@@ -156,6 +164,7 @@ def tessellate(mesh: Mesh, longest_edge: float) -> Mesh:
             f"mesh {mesh.name!r}: edges of at most {longest_edge} m need more than {MOST_FACES} faces; "
             "choose a longer longest_edge"
         )
+    origin = np.arange(len(faces))
     while True:
         ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
         key, edge = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
@@ -170,14 +179,16 @@ def tessellate(mesh: Mesh, longest_edge: float) -> Mesh:
         mean = normals[a] + normals[b]
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         normals = np.concatenate([normals, np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normals[a])])
-        faces = _split_faces(points, faces, middle)
-    return replace(
+        faces, whole = _split_faces(points, faces, middle)
+        origin = origin[whole]
+    finer = replace(
         mesh,
         vertices=_freeze(points, np.float32),
         faces=_freeze(faces, np.int32),
         normals=_freeze(normals, np.float32),
         sphere=find_sphere(points, faces, mesh.center, mesh.closed),
     )
+    return finer, origin
 
 
 def _mend_faces(name: str, points: np.ndarray, faces: np.ndarray, point_of_vertex: np.ndarray):
@@ -295,8 +306,11 @@ def _turn_outwards(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -
     return np.where(against[:, None], -normals, normals)
 
 
-def _split_faces(points: np.ndarray, faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Faces cut at the midpoints `middle` [F, 3] of their edges (0-1, 1-2, 2-0), -1 where an edge stays whole."""
+def _split_faces(points: np.ndarray, faces: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces cut at the midpoints `middle` [F, 3] of their edges (0-1, 1-2, 2-0), -1 where an edge stays whole.
+
+    Returns the pieces and which of `faces` each was.
+    """
     cuts = (middle >= 0).sum(axis=1)
     pieces = [faces[cuts == 0]]
     # Turned so that the one cut edge comes first: from its midpoint to the opposite corner.
@@ -309,7 +323,8 @@ def _split_faces(points: np.ndarray, faces: np.ndarray, middle: np.ndarray) -> n
     pieces += [np.stack([a, p, np.where(shorter, q, c)], axis=1), np.stack([np.where(shorter, a, p), q, c], axis=1)]
     (a, b, c), (p, q, r) = _turn(faces, middle, cuts == 3, np.zeros(len(faces), dtype=np.int64))
     pieces += [np.stack(corners, axis=1) for corners in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))]
-    return np.concatenate(pieces)
+    # A face with k cuts has become k + 1.
+    return np.concatenate(pieces), np.concatenate([np.tile(np.flatnonzero(cuts == k), k + 1) for k in range(4)])
 
 
 def _turn(faces: np.ndarray, middle: np.ndarray, chosen: np.ndarray, start: np.ndarray):
