@@ -12,7 +12,7 @@ from warp_psf.scene.texture import cube_to_panorama, decode
 
 # Rows of a panorama per pixel of a cube's side: the middle of a side is as finely resolved as the cube has it.
 ROWS_PER_PIXEL = 2
-MOST_ROWS = 1024
+MOST_ROWS = 768
 
 
 def read_skybox(model: mujoco.MjModel, material_space: str) -> Environment | None:
