@@ -44,7 +44,9 @@ def test_bake_leaves_nothing_for_the_renderer_to_bake(tmp_path):
     assert [row[1] for row in rows.values()] == ["1", "1", "2", "4"]
     assert rows["plane"][2:] == ["-", "-", "-", "-"]
     assert rows["sphere"][3:5] == ["-", "-"]
-    assert all(float(rows[name][2]) >= 0 for name in ("sphere", "sphere #2", "all"))
+    # A sphere of another size is the same shape, which is baked once.
+    assert "cached" in {rows["sphere"][2], rows["sphere #2"][2]}
+    assert float(rows["all"][2]) >= 0
 
     shares = []
     model = mujoco.MjModel.from_xml_path(str(path))
