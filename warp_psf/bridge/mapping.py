@@ -31,8 +31,8 @@ def make_mapping(
     uniform = bool(model.mat_texuniform[material])
     if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
         wrap, drawn = Wrap.CUBE_CAPSULE if kind == GEOM.mjGEOM_CAPSULE else Wrap.CUBE, _drawn_size(GEOM(kind), size)
-        # Endless planes have no size to be uniform over.
-        stretch = np.where(uniform & (drawn > 0.0), drawn, 1.0)
+        # An endless plane has no size to be uniform over.
+        stretch = drawn if uniform and drawn[:2].any() else np.ones(3)
         return Mapping(wrap, size=_triple(shape), stretch=_triple(stretch))
     drawn = _drawn_size(GEOM(kind), size)[:2]
     if (kind in MESHES and model.mesh_texcoordadr[data_id] < 0) or kind == GEOM.mjGEOM_HFIELD:

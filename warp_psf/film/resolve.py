@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import warp as wp
@@ -123,79 +124,6 @@ def seen_tint(
     )
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def _resolve_pixels(
-    first: int,
-    geometry: GeometryTable,
-    poses: PoseTable,
-    camera: CameraTable,
-    receivers: ReceiverTable,
-    extra: wp.array2d(dtype=wp.int32),  # (world, pixel)
-    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
-    glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
-    indirect_diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
-    indirect_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
-    textures: TextureTable,
-    background: wp.array2d(dtype=wp.vec3),
-    layers: LayerTable,
-):
-    world, pixel = wp.tid()
-    pixel += first
-    x = float(pixel % camera.width) + 0.5
-    y = float(pixel / camera.width) + 0.5
-    start = extra[world, pixel]
-    groups = wp.where(start >= 0, wp.static(EXTRA_GROUPS + 1), 1)
-    light = wp.vec3()
-    bounced = wp.vec3()
-    shine = wp.vec3()
-    albedo = wp.vec3()
-    normal = wp.vec3()
-    covered = float(0.0)
-    for group in range(groups):
-        slot = wp.where(group == 0, pixel, start + group - 1)
-        entity = receivers.entity[world, slot]
-        if entity >= 0:
-            weight = receivers.weight[world, slot]
-            part = part_of(geometry, entity, receivers.face[world, slot])
-            reflectance = geometry.albedo[part]
-            emission = geometry.emission[part]
-            if textures.texture[part] >= 0:
-                tint = seen_tint(world, pixel, slot, receivers, geometry, poses, camera, textures, part)
-                reflectance = wp.cw_mul(tint, reflectance)
-                emission = wp.cw_mul(tint, emission)
-            lobe = geometry.specular[entity]
-            lambert = reflectance * wp.static(1.0 / math.pi)
-            light += weight * (wp.cw_mul(lambert, diffuse[world, slot]) + wp.cw_mul(lobe, glossy[world, slot]))
-            bounced += weight * (
-                wp.cw_mul(lambert, indirect_diffuse[world, slot]) + wp.cw_mul(lobe, indirect_glossy[world, slot])
-            )
-            if wp.max(emission) > 0.0:
-                # Surfaces shine from their fronts.
-                shine += wp.where(shows_front(receivers, world, slot, geometry, poses), weight, 0.0) * emission
-            albedo += weight * reflectance
-            normal += weight * receivers.normal[world, slot]
-            covered += weight
-    layers.direct[world, pixel] = light
-    layers.indirect[world, pixel] = bounced
-    color = light + bounced + shine
-    if covered < 1.0:
-        color += (1.0 - covered) * look_up(background, camera_ray(camera, world, x, y))
-    layers.color[world, pixel] = color
-    layers.albedo[world, pixel] = albedo
-    layers.normal[world, pixel] = wp.normalize(normal)
-
-    # Depth and segmentation are those of the pixel's centre: a mean of two bodies is neither.
-    depth = float(wp.inf)
-    objects = wp.vec2i(-1, -1)
-    entity = receivers.entity[world, pixel]
-    if entity >= 0:
-        depth = receivers.depth[world, pixel]
-        part = part_of(geometry, entity, receivers.face[world, pixel])
-        objects = wp.vec2i(geometry.object_id[part], geometry.object_type[part])
-    layers.depth[world, pixel] = depth
-    layers.segmentation[world, pixel] = objects
-
-
 def make_film(worlds: int, width: int, height: int, background: np.ndarray, device: wp.Device) -> Film:
     """Room for the layers of width x height pixels before a background, radiance float32 [rows, columns, 3]."""
     table = LayerTable()
@@ -205,6 +133,86 @@ def make_film(worlds: int, width: int, height: int, background: np.ndarray, devi
     table.depth = wp.zeros(shape, dtype=wp.float32, device=device)
     table.segmentation = wp.zeros(shape, dtype=wp.vec2i, device=device)
     return Film(table, wp.array(background, dtype=wp.vec3, ndim=2, device=device), height, width)
+
+
+@cache
+def _make_resolve(textured: bool) -> wp.Kernel:
+    """The kernel of `resolve_pixels`; scenes without textures pay nothing for them."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def resolve_pixels(
+        first: int,
+        geometry: GeometryTable,
+        poses: PoseTable,
+        camera: CameraTable,
+        receivers: ReceiverTable,
+        extra: wp.array2d(dtype=wp.int32),  # (world, pixel)
+        diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+        glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+        indirect_diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+        indirect_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+        textures: TextureTable,
+        background: wp.array2d(dtype=wp.vec3),
+        layers: LayerTable,
+    ):
+        world, pixel = wp.tid()
+        pixel += first
+        x = float(pixel % camera.width) + 0.5
+        y = float(pixel / camera.width) + 0.5
+        start = extra[world, pixel]
+        groups = wp.where(start >= 0, wp.static(EXTRA_GROUPS + 1), 1)
+        light = wp.vec3()
+        bounced = wp.vec3()
+        shine = wp.vec3()
+        albedo = wp.vec3()
+        normal = wp.vec3()
+        covered = float(0.0)
+        for group in range(groups):
+            slot = wp.where(group == 0, pixel, start + group - 1)
+            entity = receivers.entity[world, slot]
+            if entity >= 0:
+                weight = receivers.weight[world, slot]
+                part = part_of(geometry, entity, receivers.face[world, slot])
+                reflectance = geometry.albedo[part]
+                emission = geometry.emission[part]
+                if wp.static(textured):
+                    if textures.texture[part] >= 0:
+                        tint = seen_tint(world, pixel, slot, receivers, geometry, poses, camera, textures, part)
+                        reflectance = wp.cw_mul(tint, reflectance)
+                        emission = wp.cw_mul(tint, emission)
+                lobe = geometry.specular[entity]
+                lambert = reflectance * wp.static(1.0 / math.pi)
+                light += weight * (wp.cw_mul(lambert, diffuse[world, slot]) + wp.cw_mul(lobe, glossy[world, slot]))
+                bounced += weight * (
+                    wp.cw_mul(lambert, indirect_diffuse[world, slot]) + wp.cw_mul(lobe, indirect_glossy[world, slot])
+                )
+                if wp.max(emission) > 0.0:
+                    # Surfaces shine from their fronts.
+                    shine += wp.where(shows_front(receivers, world, slot, geometry, poses), weight, 0.0) * emission
+                albedo += weight * reflectance
+                normal += weight * receivers.normal[world, slot]
+                covered += weight
+        layers.direct[world, pixel] = light
+        layers.indirect[world, pixel] = bounced
+        color = light + bounced + shine
+        if covered < 1.0:
+            color += (1.0 - covered) * look_up(background, camera_ray(camera, world, x, y))
+        layers.color[world, pixel] = color
+        layers.albedo[world, pixel] = albedo
+        layers.normal[world, pixel] = wp.normalize(normal)
+
+        # Depth and segmentation are those of the pixel's centre: a mean of two bodies is neither.
+        depth = float(wp.inf)
+        objects = wp.vec2i(-1, -1)
+        entity = receivers.entity[world, pixel]
+        if entity >= 0:
+            depth = receivers.depth[world, pixel]
+            part = part_of(geometry, entity, receivers.face[world, pixel])
+            objects = wp.vec2i(geometry.object_id[part], geometry.object_type[part])
+        layers.depth[world, pixel] = depth
+        layers.segmentation[world, pixel] = objects
+
+    return resolve_pixels
 
 
 def resolve_pixels(
@@ -221,7 +229,8 @@ def resolve_pixels(
     direct, indirect: irradiance and radiance through the Phong lobe, vec3 (world, slot) each.
     """
     inputs = [scene.geometry, scene.poses, surfaces.camera, surfaces.receivers, surfaces.extra, *direct, *indirect]
-    launch(_resolve_pixels, surfaces.extra.shape, [*inputs, textures, film.background, film.layers], [], device)
+    kernel = _make_resolve(textures.levels.shape[0] > 0)
+    launch(kernel, surfaces.extra.shape, [*inputs, textures, film.background, film.layers], [], device)
 
 
 LAYERS = ("color", "direct", "indirect", "albedo", "normal", "depth", "segmentation")

@@ -96,8 +96,8 @@ def cube_to_panorama(cube: np.ndarray, rows: int) -> np.ndarray:
 
     Direction (x, y, z) of the world is looked up at (x, z, -y): MuJoCo's skyboxes have y upwards.
     """
-    theta = np.pi * (np.arange(rows) + 0.5) / rows
-    phi = np.pi * (np.arange(2 * rows) + 0.5) / rows
+    theta = (np.pi * (np.arange(rows) + 0.5) / rows).astype(np.float32)
+    phi = (np.pi * (np.arange(2 * rows) + 0.5) / rows).astype(np.float32)
     x = np.sin(theta)[:, None] * np.cos(phi)
     y = np.sin(theta)[:, None] * np.sin(phi)
     z = np.broadcast_to(np.cos(theta)[:, None], x.shape)

@@ -11,6 +11,8 @@ from warp_psf.scene.texture import DECODED, LINEAR, Texture, Wrap, decode, encod
 
 # A footprint longer than wide is filtered by several lookups along it, at most so many.
 MOST_LOOKUPS = 12
+# Coordinates beyond so many images tell no pixels apart in float32; files may hold such numbers, and NaN.
+FARTHEST = 1.0e6
 # A point this near the ends of a cylinder's unit height, with a normal along its axis, lies on an end.
 END_NORMAL = 0.7
 
@@ -94,24 +96,9 @@ def off_side(side: int, s: float, t: float) -> wp.vec3:
 
 
 @wp.func
-def texel(table: TextureTable, level: int, srgb: int, cube: bool, side: int, column: int, row: int) -> wp.vec3:
-    """One linear colour; flat textures repeat, beyond a side of a cube follows its neighbour."""
-    extent = table.extent[level]
-    x = column
-    y = row
-    on = side
-    if not cube:
-        x = column - int(wp.floor(float(column) / float(extent[0]))) * extent[0]
-        y = row - int(wp.floor(float(row) / float(extent[1]))) * extent[1]
-    elif column < 0 or row < 0 or column >= extent[0] or row >= extent[1]:
-        s = (float(column) + 0.5) / float(extent[0])
-        t = (float(row) + 0.5) / float(extent[1])
-        d = off_side(side, s, t)
-        on = cube_side(d)
-        place = on_side(d, on)
-        x = wp.clamp(int(place[0] * float(extent[0])), 0, extent[0] - 1)
-        y = wp.clamp(int(place[1] * float(extent[1])), 0, extent[1] - 1)
-    packed = table.texels[table.first_texel[level] + (on * extent[1] + y) * extent[0] + x]
+def texel(table: TextureTable, at: int, srgb: int) -> wp.vec3:
+    """One linear colour."""
+    packed = table.texels[at]
     return wp.vec3(
         table.decoded[srgb, int(packed & wp.uint32(255))],
         table.decoded[srgb, int((packed >> wp.uint32(8)) & wp.uint32(255))],
@@ -120,22 +107,56 @@ def texel(table: TextureTable, level: int, srgb: int, cube: bool, side: int, col
 
 
 @wp.func
+def beyond_side(first: int, extent: wp.vec2i, side: int, column: int, row: int) -> int:
+    """The texel of a cube at a place of a side's grid that may lie beyond it, on its neighbour."""
+    s = (float(column) + 0.5) / float(extent[0])
+    t = (float(row) + 0.5) / float(extent[1])
+    d = off_side(side, s, t)
+    on = cube_side(d)
+    place = on_side(d, on)
+    x = wp.clamp(int(place[0] * float(extent[0])), 0, extent[0] - 1)
+    y = wp.clamp(int(place[1] * float(extent[1])), 0, extent[1] - 1)
+    return first + (on * extent[1] + y) * extent[0] + x
+
+
+@wp.func
 def bilinear(table: TextureTable, level: int, srgb: int, cube: bool, side: int, s: float, t: float) -> wp.vec3:
-    """A colour of one level."""
+    """A colour of one level; flat textures repeat, beyond a side of a cube follows its neighbour."""
     extent = table.extent[level]
+    first = table.first_texel[level]
     x = s * float(extent[0]) - 0.5
     y = t * float(extent[1]) - 0.5
+    if not cube:
+        x = (s - wp.floor(s)) * float(extent[0]) - 0.5
+        y = (t - wp.floor(t)) * float(extent[1]) - 0.5
     column = int(wp.floor(x))
     row = int(wp.floor(y))
     u = x - float(column)
     v = y - float(row)
-    upper = (1.0 - u) * texel(table, level, srgb, cube, side, column, row) + u * texel(
-        table, level, srgb, cube, side, column + 1, row
-    )
-    lower = (1.0 - u) * texel(table, level, srgb, cube, side, column, row + 1) + u * texel(
-        table, level, srgb, cube, side, column + 1, row + 1
-    )
-    return (1.0 - v) * upper + v * lower
+    a = int(0)
+    b = int(0)
+    c = int(0)
+    d = int(0)
+    if cube and (column < 0 or row < 0 or column >= extent[0] - 1 or row >= extent[1] - 1):
+        a = beyond_side(first, extent, side, column, row)
+        b = beyond_side(first, extent, side, column + 1, row)
+        c = beyond_side(first, extent, side, column, row + 1)
+        d = beyond_side(first, extent, side, column + 1, row + 1)
+    else:
+        # Rounding may take a flat place up to its far end.
+        left = wp.where(column < 0, extent[0] - 1, wp.min(column, extent[0] - 1))
+        right = wp.where(left + 1 < extent[0], left + 1, 0)
+        upper = wp.where(row < 0, extent[1] - 1, wp.min(row, extent[1] - 1))
+        lower = wp.where(upper + 1 < extent[1], upper + 1, 0)
+        upper = first + (side * extent[1] + upper) * extent[0]
+        lower = first + (side * extent[1] + lower) * extent[0]
+        a = upper + left
+        b = upper + right
+        c = lower + left
+        d = lower + right
+    top = (1.0 - u) * texel(table, a, srgb) + u * texel(table, b, srgb)
+    bottom = (1.0 - u) * texel(table, c, srgb) + u * texel(table, d, srgb)
+    return (1.0 - v) * top + v * bottom
 
 
 @wp.func
@@ -146,6 +167,10 @@ def filtered(
     first = table.first_level[texture]
     finest = table.extent[first]
     span = wp.vec2(float(finest[0]), float(finest[1]))
+    reach = wp.max(wp.abs(place)) + wp.max(wp.abs(along_x)) + wp.max(wp.abs(along_y))
+    # NaN is not below either. The mean of the image is in its last level.
+    if not (reach < wp.static(FARTHEST)):
+        return bilinear(table, first + table.levels[texture] - 1, table.srgb[texture], cube, side, 0.5, 0.5)
     longer = along_x
     shorter = along_y
     if wp.length(wp.cw_mul(along_x, span)) < wp.length(wp.cw_mul(along_y, span)):
@@ -156,7 +181,7 @@ def filtered(
     a = wp.cw_mul(longer, span)
     b = wp.cw_mul(shorter, span)
     width = wp.abs(a[0] * b[1] - a[1] * b[0]) / wp.max(length, 1.0e-12)
-    lookups = int(wp.clamp(wp.ceil(length / wp.max(width, 1.0)), 1.0, float(wp.static(MOST_LOOKUPS))))
+    lookups = int(wp.clamp(wp.round(length / wp.max(width, 1.0)), 1.0, float(wp.static(MOST_LOOKUPS))))
     blur = wp.log2(wp.max(wp.max(width, length / float(lookups)), 1.0))
     blur = wp.min(blur, float(table.levels[texture] - 1))
     low = int(wp.floor(blur))
