@@ -203,3 +203,27 @@ def test_more_and_more_geoms_find_room():
                 add_geom(renderer.scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.05, 0, 0), (0.05 * index - 1, 0, 0.5))
             assert np.isfinite(renderer.layers()["color"]).all()
             assert renderer.scene.ngeom > count
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"type": int(mujoco.mjtGeom.mjGEOM_MESH), "dataid": 8}, "dataid 8"),
+        ({"type": int(mujoco.mjtGeom.mjGEOM_SKIN)}, "from the model alone"),
+        ({"matid": 3}, "matid 3"),
+        ({"rgba": (np.nan, 0, 0, 1)}, "finite"),
+    ],
+)
+def test_added_geoms_that_name_nothing_are_refused(change, reason):
+    model, data = start(TENDON)
+    with psf.Renderer(model, 12, 16, bounces=0) as renderer:
+        renderer.update_scene(data, "front")
+        picture = renderer.render()
+        add_geom(renderer.scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.1, 0, 0), (0, 0, 0.5))
+        for name, value in change.items():
+            setattr(renderer.scene.geoms[renderer.scene.ngeom - 1], name, value)
+        with pytest.raises(ValueError, match=reason):
+            renderer.render()
+        # Nothing is lost: the next state is drawn as before.
+        renderer.update_scene(data, "front")
+        np.testing.assert_array_equal(renderer.render(), picture)

@@ -162,3 +162,11 @@ def test_a_body_stops_light_in_proportion_to_its_opacity():
     assert (none - whole).max() > 0.2 * none.max()
     # Lattice pixels between shaded ones are interpolated to a hundredth.
     np.testing.assert_allclose(half, 0.5 * (whole + none), rtol=0.02, atol=0.01)
+
+
+def test_wrong_options(model, data):
+    with pytest.raises(ValueError, match="max_geom is 0"):
+        psf.Renderer(model, 4, 4, 0)
+    renderer = psf.Renderer(model, 4, 4, bounces=0)
+    with pytest.raises(TypeError, match=r"scene_option is a str; give a mujoco\.MjvOption"):
+        renderer.update_scene(data, "front", "all")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import NoReturn
 
 import mujoco
@@ -97,6 +97,8 @@ class Renderer:
     ):
         _check_model(model)
         _check_options(height, width, order, shading, exposure, view)
+        if not isinstance(max_geom, Integral) or max_geom < 1:
+            raise ValueError(f"max_geom is {max_geom!r}; give a whole number of geoms, at least 1")
         _check_bounces(bounces, bounce_threshold, basis_functions)
         self._model = model
         self._settings = Settings(
@@ -117,7 +119,7 @@ class Renderer:
         self._skybox = read_skybox(model, material_space)
         self._progress = progress or (lambda what, share: None)
         self._option = mujoco.MjvOption()
-        self._scene = mujoco.MjvScene(model, max_geom)
+        self._scene = mujoco.MjvScene(model, int(max_geom))
         self._shown = 0
         self._looks = looks(model, self._option)
         self._standing: Stage | None = self._set_stage(self._option, self._first_room())
@@ -191,10 +193,15 @@ class Renderer:
 
         Raises:
             ValueError: there is no such camera, or `data` is of another model.
+            TypeError: `scene_option` is no MjvOption.
         """
         stage = self._stage
         view = read_camera(self._model, data, camera)
         option = self._option if scene_option is None else scene_option
+        if not isinstance(option, mujoco.MjvOption):
+            raise TypeError(
+                f"scene_option is a {type(option).__name__}; give a mujoco.MjvOption, or None for the defaults"
+            )
         now = looks(self._model, option)
         if now != self._looks:
             self._standing = self._set_stage(option, stage.room)

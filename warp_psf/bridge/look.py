@@ -33,7 +33,12 @@ def make_material(model: mujoco.MjModel, rgba: np.ndarray, material: int, materi
     2/roughness^4 - 2, the Phong lobe that is as wide as the microfacets' slopes. Where the sum of both reflectances
     exceeds 1 both are scaled down. MuJoCo's emission times the colour is the radiance sent out. A texture multiplies
     albedo and emission, not the lobe.
+
+    Raises:
+        ValueError: the colour is not finite.
     """
+    if not np.isfinite(rgba).all():
+        raise ValueError(f"a colour is {np.asarray(rgba).tolist()}; every number of an rgba must be finite")
     specular, shininess, emission, metallic, roughness = DEFAULT_SPECULAR, DEFAULT_SHININESS, 0.0, -1.0, -1.0
     if material >= 0:
         specular, shininess = float(model.mat_specular[material]), float(model.mat_shininess[material])

@@ -27,6 +27,9 @@ def read_loose(
     view: after mjv_updateScene. shown: how many geoms that left in it; those behind were added by a script and are
     drawn too, while MuJoCo's own decor (contacts, frames, joints) is not. metres_per_pixel: at a distance of 1 m, for
     lines, whose width is in pixels.
+
+    Raises:
+        ValueError: an added geom names a mesh or a material that the model lacks, or has a colour that is not finite.
     """
     surfaces: list[Surface] = []
     parts: list[Part] = []
@@ -34,7 +37,9 @@ def read_loose(
     for index, geom in enumerate(view.geoms[: view.ngeom]):
         added = index >= shown
         if added or (geom.objtype not in (OBJECT.mjOBJ_GEOM, OBJECT.mjOBJ_SITE) and geom.category != DECOR):
-            if geom.rgba[3] > 0.0:
+            if added:
+                _check_added(model, geom)
+            if geom.rgba[3] != 0.0:
                 surface = _surface(model, view, geom, eye, metres_per_pixel)
                 if surface is not None and len(surface[2]) > 0:
                     surfaces.append(surface)
@@ -51,6 +56,18 @@ def read_loose(
         np.repeat(np.arange(len(parts)), [len(faces) for _, _, faces in surfaces]).astype(np.int32),
         tuple(parts),
     )
+
+
+def _check_added(model: mujoco.MjModel, geom: mujoco.MjvGeom) -> None:
+    """Raises ValueError where a geom that a script added names a thing that the model lacks."""
+    if geom.type in (GEOM.mjGEOM_FLEX, GEOM.mjGEOM_SKIN):
+        raise ValueError("a geom added to the scene is a flex or a skin; those are drawn from the model alone")
+    if geom.type in MESHES and geom.dataid >= 2 * model.nmesh:
+        raise ValueError(
+            f"a geom added to the scene has the dataid {geom.dataid}; give 2 * mesh id, below {2 * model.nmesh}"
+        )
+    if geom.matid >= model.nmat:
+        raise ValueError(f"a geom added to the scene has the matid {geom.matid}; the model has {model.nmat} materials")
 
 
 def _part(model: mujoco.MjModel, geom: mujoco.MjvGeom, material_space: str) -> Part:
