@@ -14,7 +14,7 @@ import sys
 
 import numpy as np
 
-RULES = {16: 5, 32: 9, 64: 13, 96: 15}  # points: degree
+RULES = {16: 5, 32: 9, 64: 13, 96: 15, 176: 21}  # points: degree
 STARTS = 40
 ITERATIONS = 500
 # Of the mean weight; rounding leaves about 1e-15.

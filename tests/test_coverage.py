@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from warp_psf.basis import sh, sphere
+from warp_psf.basis.directions import basis_at_directions, quadrature_rows
 from warp_psf.device import find_device, launch
 from warp_psf.shade.coverage import make_coverage
-from warp_psf.shade.directions import basis_at_directions, quadrature_rows
 
 # Directions of the brute-force projection: with 40,000 the projection of an indicator is good to about 1e-3.
 DIRECTIONS = sphere.fibonacci_cap(40_000)

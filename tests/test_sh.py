@@ -207,7 +207,7 @@ def test_caps_of_many_angles_at_once():
 def make_every_function(order: int):
     """A kernel that runs every Warp function of an order."""
     functions = sh.make_sh(order)
-    vec = functions.vec
+    vec, per_band = functions.vec, wp.types.vector(order, wp.float32)
 
     @wp.kernel(module="unique")
     def run_every_function(
@@ -216,7 +216,7 @@ def make_every_function(order: int):
         rows: wp.array3d(dtype=vec),
         values_out: wp.array(dtype=vec),
         turned_out: wp.array(dtype=vec),
-        product_out: wp.array(dtype=vec),
+        zonal_out: wp.array(dtype=vec),
         integral_out: wp.array(dtype=wp.float32),
     ):
         world, item = wp.tid()
@@ -225,7 +225,7 @@ def make_every_function(order: int):
         turned = functions.rotate(values, rows[world, 1])
         values_out[item] = values
         turned_out[item] = turned
-        product_out[item] = functions.triple_product(values, turned)
+        zonal_out[item] = functions.zonal(wp.static(per_band(*range(1, order + 1))), directions[item])
         integral_out[item] = functions.double_product(values, turned)
 
     return run_every_function
@@ -246,7 +246,8 @@ def test_warp_agrees_with_numpy(order):
     device.launch(make_every_function(order), (1, count), inputs, outputs, target)
     values = sh.evaluate(directions, order)
     turned = sh.rotate(values, rotations[1])
-    expected = (values, turned, sh.triple_product(values, turned), sh.double_product(values, turned))
+    zonal = (1 + sh.bands(order)) * values
+    expected = (values, turned, zonal, sh.double_product(values, turned))
     for got, want in zip(outputs, expected, strict=True):
         np.testing.assert_allclose(got.numpy(), want, atol=FLOAT32)
 

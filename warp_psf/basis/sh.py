@@ -214,7 +214,9 @@ class SH:
     evaluate(direction: wp.vec3) -> vec: the basis functions
     rotate(v: vec, rows: wp.array(dtype=vec)) -> vec: sum of v[k] rows[k], with `rows` from `rotation_rows`
     double_product(a: vec, b: vec) -> float: the integral of the product of two functions
-    triple_product(a: vec, b: vec) -> vec: the product of two functions, truncated to the order
+    zonal(bands: vector of n floats, direction: wp.vec3) -> vec: the basis functions, each times the number of its band
+
+    Products of functions are formed at the directions of a quadrature: see `sh_exp.make_sh_exp`.
     """
 
     order: int
@@ -223,7 +225,7 @@ class SH:
     evaluate: wp.Function
     rotate: wp.Function
     double_product: wp.Function
-    triple_product: wp.Function
+    zonal: wp.Function
 
 
 @cache
@@ -241,8 +243,8 @@ def make_sh(order: int) -> SH:
     @wp.func_native(_evaluate_snippet(order))
     def evaluate(direction: wp.vec3) -> vec: ...
 
-    @wp.func_native(_triple_product_snippet(order))
-    def triple_product(a: vec, b: vec) -> vec: ...
+    @wp.func_native(_evaluate_snippet(order, "bands"))
+    def zonal(bands: wp.types.vector(order, wp.float32), direction: wp.vec3) -> vec: ...
 
     @wp.func_native(_rotate_snippet(order))
     def rotate(v: vec, rows: wp.array(dtype=vec)) -> vec: ...
@@ -251,11 +253,14 @@ def make_sh(order: int) -> SH:
     def double_product(a: vec, b: vec) -> float:
         return wp.dot(a, b)
 
-    return SH(order, count, vec, evaluate, rotate, double_product, triple_product)
+    return SH(order, count, vec, evaluate, rotate, double_product, zonal)
 
 
-def _evaluate_snippet(order: int) -> str:
-    """C++ for the basis functions: a polynomial in z by Horner's rule, times a part of (x + iy)^m."""
+def _evaluate_snippet(order: int, bands: str = "") -> str:
+    """C++ for the basis functions: a polynomial in z by Horner's rule, times a part of (x + iy)^m.
+
+    bands: the name of a vector whose numbers multiply the functions of each band.
+    """
     lines = ["const float x = direction[0], y = direction[1], z = direction[2];"]
     lines += ["const float c0 = 1.0f, s0 = 0.0f;"]
     lines += [f"wp::vec_t<{order * order}, float> values;"]
@@ -267,7 +272,7 @@ def _evaluate_snippet(order: int) -> str:
             height = _literal(polynomial[-1])
             for coefficient in polynomial[-2::-1]:
                 height = f"({height} * z + {_literal(coefficient)})"
-            lines += [f"const float h{centre + m} = {height};"]
+            lines += [f"const float h{centre + m} = {height}{f' * {bands}[{band}]' if bands else ''};"]
             lines += [f"values[{centre - m}] = h{centre + m} * s{m};"] if m else []
             lines += [f"values[{centre + m}] = h{centre + m} * c{m};"]
     return "\n".join([*lines, "return values;"])
@@ -293,21 +298,6 @@ def _rotate_snippet(order: int) -> str:
         lines += [f"const auto& row{k} = wp::index(rows, {k});" for k in block]
         lines += [f"turned[{j}] = {' + '.join(f'v[{k}] * row{k}[{j}]' for k in block)};" for j in block]
     return "\n".join([*lines, "return turned;"])
-
-
-def _triple_product_snippet(order: int) -> str:
-    """C++ for the triple product: sums of products a_i b_j, gathered by the tripling coefficient they share."""
-    tensor = tripling_tensor(order)
-    count = coefficient_count(order)
-    lines = [f"wp::vec_t<{count}, float> product;"]
-    for k in range(count):
-        groups: dict[str, list[str]] = {}
-        for i, j in np.argwhere(np.triu(tensor[k])):
-            pair = f"a[{i}] * b[{j}]" + (f" + a[{j}] * b[{i}]" if i != j else "")
-            groups.setdefault(_literal(tensor[k, i, j]), []).append(pair)
-        terms = [f"{value} * ({' + '.join(pairs)})" for value, pairs in groups.items()]
-        lines += [f"product[{k}] = {' + '.join(terms)};"]
-    return "\n".join([*lines, "return product;"])
 
 
 def _literal(value: float) -> str:

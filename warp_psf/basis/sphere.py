@@ -12,10 +12,10 @@ import numpy as np
 import warp as wp
 
 # The rules of `quadrature`: points -> degree. Every spherical harmonic of that degree or less is integrated exactly.
-QUADRATURE_DEGREES = {16: 5, 32: 9, 64: 13, 96: 15}
+QUADRATURE_DEGREES = {16: 5, 32: 9, 64: 13, 96: 15, 176: 21}
 # SH order (bands) -> points of the rule that is exact for the product of three functions of the order, degree
 # 3 (order - 1), and at least for one degree more up to order 5.
-QUADRATURE_POINTS = {2: 16, 3: 32, 4: 64, 5: 96, 6: 96}
+QUADRATURE_POINTS = {2: 16, 3: 32, 4: 64, 5: 96, 6: 96, 8: 176}
 
 
 def latlong_directions(rows: int, columns: int) -> np.ndarray:

@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_psf.basis import sh
+from warp_psf.basis.directions import sum_in_lanes
 from warp_psf.scene.geometry import GeometryTable, PoseTable
 from warp_psf.shade.area import make_area
 from warp_psf.shade.direct import legendre_series
-from warp_psf.shade.directions import sum_in_lanes
 from warp_psf.shade.occlude import make_occlude
 from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
 from warp_psf.shade.relations import faces_ahead

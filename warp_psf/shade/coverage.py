@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warp_psf.basis.directions import make_directions
 from warp_psf.field.shells import make_fields
-from warp_psf.shade.directions import make_directions
 from warp_psf.shade.slab import make_slab
 
 NO_SHAPE, FIELD_SHAPE, SPHERE_SHAPE, SLAB_SHAPE = 0, 1, 2, 3

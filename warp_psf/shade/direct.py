@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_psf.basis import sh
+from warp_psf.basis.directions import basis_at_directions, quadrature_weights
 from warp_psf.device import launch
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.area import make_area
-from warp_psf.shade.directions import basis_at_directions, quadrature_weights
 from warp_psf.shade.occlude import OcclusionState, make_occlude
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_psf.basis.directions import along_axis_snippet, project_products_snippet
 from warp_psf.device import launch
 from warp_psf.field.moments import FIRST, SECOND
 from warp_psf.field.radiance import SummedFields
@@ -19,7 +20,6 @@ from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.delta import DeltaLightTable, DeltaState, delta_light
 from warp_psf.shade.direct import DirectState
-from warp_psf.shade.directions import along_axis_snippet, project_products_snippet
 from warp_psf.shade.faces import make_faces
 from warp_psf.shade.occlude import OcclusionState
 from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin

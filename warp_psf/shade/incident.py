@@ -13,11 +13,11 @@ import numpy as np
 import warp as wp
 
 from warp_psf.basis import sh, sphere
+from warp_psf.basis.directions import make_directions, project_snippet
 from warp_psf.scene.geometry import GeometryTable, PoseTable
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import overlap
 from warp_psf.shade.bounce import make_bounce
-from warp_psf.shade.directions import make_directions, project_snippet
 from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
 from warp_psf.shade.relations import RelationTable, hides_body, hides_face
 

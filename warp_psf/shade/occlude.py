@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_psf.basis import sh, sphere
+from warp_psf.basis.directions import quadrature_rows
 from warp_psf.device import launch
 from warp_psf.field.shells import ShadowField, upload_fields
 from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
-from warp_psf.shade.directions import quadrature_rows
 
 # An occluder whose bounding sphere could take less than this share of a diffuse receiver's light is left out: seen
 # face-on a sphere of radius R at distance d takes (R/d)^2. It fades in up to twice the share, so that nothing pops.

@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.basis import sphere
-from warp_psf.shade.directions import make_directions
+from warp_psf.basis.directions import make_directions
 
 # The twelve edges, and room for the sixteen lanes of a vector.
 LANES = 16
