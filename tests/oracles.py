@@ -14,7 +14,7 @@ from warp_psf.scene.light import area_light_entities
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import make_receivers
 from warp_psf.shade.direct import shade_direct
-from warp_psf.shade.occlude import turn_occlusion
+from warp_psf.shade.occluders import turn_occlusion
 
 # Rays start this far off the surface, metres: the models under test are centimetres to metres large.
 RAY_OFFSET = 1e-4

@@ -140,7 +140,7 @@ def make_every_method(order: int):
         sines: wp.array(dtype=wp.float32),
         axes: wp.array(dtype=wp.vec3),
         norm_of_nine: float,
-        table: ExpTable,
+        table: wp.array(dtype=ExpTable),
         out: wp.array2d(dtype=vec),
     ):
         world, item = wp.tid()

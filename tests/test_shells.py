@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from warp_psf.basis import sphere
-from warp_psf.device import find_device, launch
+from warp_psf.device import find_device, launch, upload_tables
 from warp_psf.field.shells import (
     FIRST_OUTER_SHELL,
     SHELL_COUNT,
@@ -43,24 +43,24 @@ def look_up(fields):
     """Looks points [N, 3] up in one of the two fields of a table."""
     device = find_device("cpu")
     kit = make_fields(ORDER)
-    table = upload_fields(fields, ORDER, device)
+    tables = upload_tables([upload_fields(fields, ORDER, device)], kit.FieldTable, device)
 
     @wp.kernel(module="unique")
     def look_up_points(
         first: int,
-        table: kit.FieldTable,
+        tables: wp.array(dtype=kit.FieldTable),
         field: int,
         points: wp.array(dtype=wp.vec3),
         vectors_out: wp.array(dtype=kit.vec),
     ):
         world, item = wp.tid()
         item += first
-        vectors_out[item] = kit.lookup_coverage(table, field, points[item])
+        vectors_out[item] = kit.lookup_coverage(tables, 0, field, points[item])
 
     def run(field, points):
         out = wp.zeros(len(points), dtype=kit.vec, device=device)
         points = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
-        launch(look_up_points, (1, len(points)), [table, field, points], [out], device)
+        launch(look_up_points, (1, len(points)), [tables, field, points], [out], device)
         return out.numpy()
 
     return run

@@ -64,6 +64,17 @@ def launch(kernel, dim: tuple[int, int], inputs: Sequence, outputs: Sequence, de
     list(_workers().map(launch_piece, bounds[:-1], bounds[1:]))
 
 
+def upload_tables(tables: Sequence, dtype: type, device: wp.Device) -> wp.array:
+    """Structs of the type `dtype` as an array on the device, which keeps the arrays that they hold alive.
+
+    A device function copies a struct that it is given with every array in it, kilobytes for each call. Of an array of
+    one struct it copies a pointer.
+    """
+    array = wp.array(list(tables), dtype=dtype, device=device)
+    array.tables = tuple(tables)
+    return array
+
+
 def core_count() -> int:
     """The CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -33,6 +33,7 @@ from warp_psf.stage import Progress, Settings, Stage, draw, place, set_stage, ta
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
+COMPOSITIONS = ("product", "log")
 # A picture of more pixels than this is a mistyped size: its buffers would take over 30 GB.
 MOST_PIXELS = 2**27
 # After so many bounces between white walls a fiftieth of the light is left.
@@ -59,6 +60,8 @@ class Renderer:
     bounce_threshold: a body that takes up a smaller share of a point's view than this sends it no bounced light.
     basis_functions: how many functions per body stand for the light that leaves it: 4, 8, 16 or 32.
     order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
+    compose: how what bodies leave of the light is combined: "product" multiplies their visibilities, "log" adds their
+        logarithms and exponentiates the sum. See the README for which is better when.
     shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
         planes are cut finely enough for that; other meshes show what their vertices resolve, and open ones the light of
         their front on both sides.
@@ -84,6 +87,7 @@ class Renderer:
         environment: str | np.ndarray | Environment | None = "studio",
         lights: Sequence[Light] = (),
         order: int = 4,
+        compose: str = "product",
         bounces: int = 3,
         bounce_threshold: float = 0.004,
         basis_functions: int = 16,
@@ -96,7 +100,7 @@ class Renderer:
         progress: Progress | None = None,
     ):
         _check_model(model)
-        _check_options(height, width, order, shading, exposure, view)
+        _check_options(height, width, order, compose, shading, exposure, view)
         if not isinstance(max_geom, Integral) or max_geom < 1:
             raise ValueError(f"max_geom is {max_geom!r}; give a whole number of geoms, at least 1")
         _check_bounces(bounces, bounce_threshold, basis_functions)
@@ -105,6 +109,7 @@ class Renderer:
             height=int(height),
             width=int(width),
             order=int(order),
+            compose=compose,
             shading=shading,
             bounces=int(bounces),
             bounce_threshold=float(bounce_threshold),
@@ -365,7 +370,7 @@ def _check_bounces(bounces: int, threshold: float, functions: int) -> None:
         raise ValueError(f"basis_functions is {functions}; choose one of {', '.join(map(str, FUNCTION_COUNTS))}")
 
 
-def _check_options(height: int, width: int, order: int, shading: str, exposure: float, view: str) -> None:
+def _check_options(height: int, width: int, order: int, compose: str, shading: str, exposure: float, view: str) -> None:
     for name, size in (("height", height), ("width", width)):
         if not np.isfinite(size) or int(size) != size or size < 1:
             raise ValueError(f"{name} is {size}; give a whole number of pixels, at least 1")
@@ -373,6 +378,8 @@ def _check_options(height: int, width: int, order: int, shading: str, exposure: 
         raise ValueError(f"a picture of {width} x {height} pixels is too large; give at most {MOST_PIXELS} pixels")
     if order not in ORDERS:
         raise ValueError(f"order is {order}; choose one of {', '.join(map(str, ORDERS))}")
+    if compose not in COMPOSITIONS:
+        raise ValueError(f"compose is {compose!r}; choose {' or '.join(map(repr, COMPOSITIONS))}")
     if shading not in SHADINGS:
         raise ValueError(f"shading is {shading!r}; choose {' or '.join(map(repr, SHADINGS))}")
     if view not in VIEWS:

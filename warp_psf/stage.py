@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.bake import bake_radiance_field
-from warp_psf.bake.bodies import bake_bodies, bake_light
+from warp_psf.bake.bodies import bake_bodies, bake_light, bake_logarithms
 from warp_psf.bake.kept import BakedBody
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import Film, make_film, resolve_pixels
@@ -30,7 +30,7 @@ from warp_psf.shade.direct import DirectState, shade_direct, upload_lighting, wr
 from warp_psf.shade.gloss import shade_gloss
 from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice, refine_lattice
-from warp_psf.shade.occlude import OcclusionState, turn_occlusion, upload_occlusion
+from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
 from warp_psf.shade.tint import tint_proxies
@@ -49,6 +49,7 @@ class Settings:
     height: int
     width: int
     order: int
+    compose: str
     shading: str
     bounces: int
     bounce_threshold: float
@@ -112,13 +113,17 @@ def set_stage(
     bodies = bake_bodies(scene, casts, order, str(device), progress)
     area_lights = area_light_entities(scene)
     fields = [bodies[entity.mesh].field for entity in scene.entities]
+    log_fields = None
+    if settings.compose == "log":
+        logarithms = bake_logarithms(scene, bodies, progress)
+        log_fields = [logarithms[entity.mesh] for entity in scene.entities]
     for light, entity in area_lights:
         fields[entity] = None
         if light.mesh.slab is None and light.mesh.sphere is None:
             radiance = np.ones(len(light.mesh.faces), np.float32)
             fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
     device_scene = upload_scene(scene, 1, device)
-    occlusion = upload_occlusion(scene, fields, order, 1, device)
+    occlusion = upload_occlusion(scene, fields, log_fields, order, 1, device)
     transfers = _transfers(bodies)
     shining = [(entity, light.radiance) for light, entity in area_lights]
     lighting = upload_lighting(scene, transfers, shining, order, 1, device)
@@ -130,7 +135,7 @@ def set_stage(
     see_through = any(entity.opacity < 1.0 for entity in scene.entities)
     surfaces = make_surfaces(1, *size, scene, settings.antialias, see_through, device)
     vertices = upload_vertices(scene, 1, device) if settings.shading == "vertex" else None
-    stored = {id(baked): baked.nbytes for baked in fields if baked is not None}
+    stored = {id(baked): baked.nbytes for baked in [*fields, *(log_fields or [])] if baked is not None}
     field_bytes = {
         "occlusion": sum(stored.values()),
         "transfer": sum(pair[0].nbytes + pair[1].nbytes for pair in transfers if pair is not None),

@@ -11,9 +11,11 @@ from typing import TypeVar
 
 from warp_psf.bake.body import bake_mesh
 from warp_psf.bake.kept import BakedBody
+from warp_psf.bake.logarithm import bake_logarithm
 from warp_psf.bake.radiance import BakedRadiance, bake_radiance
 from warp_psf.bake.shape import shape_key, unit_shape
 from warp_psf.device import core_count, find_device
+from warp_psf.field.shells import ShadowField
 from warp_psf.scene.detail import refine_radiating
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
@@ -64,6 +66,19 @@ def bake_light(
         [baked.get(entity.mesh) if casting else None for entity, casting in pairs],
         [casting and is_patch(scene.meshes[entity.mesh]) for entity, casting in pairs],
     )
+
+
+def bake_logarithms(scene: Scene, bodies: list[BakedBody], progress: Progress) -> list[ShadowField | None]:
+    """The log shadow field of every mesh whose baked body has a field; else None."""
+    # Copies of a shape follow it, who will find it kept.
+    logarithms: list[ShadowField | None] = []
+    for mesh, body in zip(scene.meshes, bodies, strict=True):
+        if body.field is not None:
+            progress(f"taking logarithms of {mesh.name}", 0.0)
+        logarithms.append(None if body.field is None else bake_logarithm(mesh, body.field))
+        if body.field is not None:
+            progress(f"taking logarithms of {mesh.name}", 1.0)
+    return logarithms
 
 
 def _casting(scene: Scene, casts: list[bool]) -> list[int]:

@@ -20,6 +20,7 @@ import warp as wp
 
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.directions import basis_at_directions, make_directions, quadrature_weights
+from warp_psf.device import upload_tables
 
 # What logarithms take the place of zero and of negative values with: Ren 2006, section 4.2.
 LOG_THRESHOLD = 0.02
@@ -244,7 +245,8 @@ def make_sh_exp(order: int) -> SimpleNamespace:
     """Device functions for `order` bands, each of which takes the `ExpTable` that `upload_exponential` fills.
 
     exponential(f, table), power_series(f, degree, table), scaled_power_series(f, degree, table),
-    optimal_linear(f, table), hybrid(f, table): the twins of the host's; product(f, g, table): the truncated product;
+    optimal_linear(f, table), hybrid(f, table): the twins of the host's; exponential_at_directions(f, table): the values
+    of the first; product(f, g, table): the truncated product;
     cap_logarithm(axis, sine, table): log_*(1 - cap) about a unit axis, by the sine of the half-angle, from a table.
     """
     kit = make_directions(order)
@@ -268,16 +270,16 @@ def make_sh_exp(order: int) -> SimpleNamespace:
     def series_at_directions(at: values) -> values: ...
 
     @wp.func
-    def product(f: vec, g: vec, table: ExpTable) -> vec:
-        at = wp.cw_mul(at_directions(f, table.rows), at_directions(g, table.rows))
-        return project(wp.cw_mul(at, table.weights[0]), table.rows)
+    def product(f: vec, g: vec, table: wp.array(dtype=ExpTable)) -> vec:
+        at = wp.cw_mul(at_directions(f, table[0].rows), at_directions(g, table[0].rows))
+        return project(wp.cw_mul(at, table[0].weights[0]), table[0].rows)
 
     @wp.func
-    def raise_to_power(g: vec, squarings: int, table: ExpTable) -> vec:
+    def raise_to_power(g: vec, squarings: int, table: wp.array(dtype=ExpTable)) -> vec:
         power = vec(g)
         for _done in range(squarings):
-            at = at_directions(power, table.rows)
-            power = project(wp.cw_mul(wp.cw_mul(at, at), table.weights[0]), table.rows)
+            at = at_directions(power, table[0].rows)
+            power = project(wp.cw_mul(wp.cw_mul(at, at), table[0].weights[0]), table[0].rows)
         return power
 
     @wp.func
@@ -295,22 +297,26 @@ def make_sh_exp(order: int) -> SimpleNamespace:
         return int(wp.ceil(wp.log2(wp.max(norm / largest, 1.0))))
 
     @wp.func
-    def exponential(f: vec, table: ExpTable) -> vec:
+    def exponential(f: vec, table: wp.array(dtype=ExpTable)) -> vec:
         rest = rest_of(f)
         squarings = squarings_of(wp.length(rest), wp.static(series_norm(SAMPLED_DEGREE)))
-        at = at_directions(rest * wp.pow(0.5, float(squarings)), table.rows)
-        series = project(wp.cw_mul(series_at_directions(at), table.weights[0]), table.rows)
+        at = at_directions(rest * wp.pow(0.5, float(squarings)), table[0].rows)
+        series = project(wp.cw_mul(series_at_directions(at), table[0].weights[0]), table[0].rows)
         return constant_of(f) * raise_to_power(series, squarings, table)
 
     @wp.func
-    def power_series(f: vec, degree: int, table: ExpTable) -> vec:
+    def exponential_at_directions(f: vec, table: wp.array(dtype=ExpTable)) -> values:
+        return at_directions(exponential(f, table), table[0].rows)
+
+    @wp.func
+    def power_series(f: vec, degree: int, table: wp.array(dtype=ExpTable)) -> vec:
         total = wp.static(unit) + f / float(degree)
         for step in range(1, degree):
             total = wp.static(unit) + product(f, total, table) / float(degree - step)
         return total
 
     @wp.func
-    def scaled_power_series(f: vec, degree: int, largest: float, table: ExpTable) -> vec:
+    def scaled_power_series(f: vec, degree: int, largest: float, table: wp.array(dtype=ExpTable)) -> vec:
         """largest: `series_norm(degree)`."""
         rest = rest_of(f)
         squarings = squarings_of(wp.length(rest), largest)
@@ -326,32 +332,33 @@ def make_sh_exp(order: int) -> SimpleNamespace:
         return fit[0] * wp.static(unit) + fit[1] * f
 
     @wp.func
-    def optimal_linear(f: vec, table: ExpTable) -> vec:
-        return linear_of(f, wp.length(f), wp.static(norm_of_linear), table.linear)
+    def optimal_linear(f: vec, table: wp.array(dtype=ExpTable)) -> vec:
+        return linear_of(f, wp.length(f), wp.static(norm_of_linear), table[0].linear)
 
     @wp.func
-    def hybrid(f: vec, table: ExpTable) -> vec:
+    def hybrid(f: vec, table: wp.array(dtype=ExpTable)) -> vec:
         rest = rest_of(f)
         norm = wp.length(rest)
         squarings = squarings_of(norm, wp.static(LINEAR_NORM))
         scale = wp.pow(0.5, float(squarings))
-        linear = linear_of(scale * rest, scale * norm, wp.static(LINEAR_NORM), table.isolated_linear)
+        linear = linear_of(scale * rest, scale * norm, wp.static(LINEAR_NORM), table[0].isolated_linear)
         return constant_of(f) * raise_to_power(linear, squarings, table)
 
     @wp.func
-    def cap_logarithm(axis: wp.vec3, sine: float, table: ExpTable) -> vec:
+    def cap_logarithm(axis: wp.vec3, sine: float, table: wp.array(dtype=ExpTable)) -> vec:
         squared = wp.min(sine * sine, 1.0)
         # 1 - cos without the difference, which would lose the digits of small caps.
         place = wp.static(steps) * squared / (1.0 + wp.sqrt(1.0 - squared))
         below = wp.min(int(place), wp.static(TABLE_SIZE - 1))
         share = place - float(below)
-        return functions.zonal((1.0 - share) * table.caps[below] + share * table.caps[below + 1], axis)
+        return functions.zonal((1.0 - share) * table[0].caps[below] + share * table[0].caps[below + 1], axis)
 
     return SimpleNamespace(
         vec=vec,
         ExpTable=ExpTable,
         product=product,
         exponential=exponential,
+        exponential_at_directions=exponential_at_directions,
         power_series=power_series,
         scaled_power_series=scaled_power_series,
         optimal_linear=optimal_linear,
@@ -360,8 +367,8 @@ def make_sh_exp(order: int) -> SimpleNamespace:
     )
 
 
-def upload_exponential(order: int, device: wp.Device) -> Any:
-    """The `ExpTable` of an order."""
+def upload_exponential(order: int, device: wp.Device) -> wp.array:
+    """The `ExpTable` of an order, as an array of one."""
     kit, directions = make_sh_exp(order), make_directions(order)
     table = kit.ExpTable()
 
@@ -374,7 +381,7 @@ def upload_exponential(order: int, device: wp.Device) -> Any:
     table.caps = upload(cap_table(order), wp.types.vector(order, wp.float32))
     table.linear = upload(linear_table(order), wp.vec2)
     table.isolated_linear = upload(isolated_linear_table(order), wp.vec2)
-    return table
+    return upload_tables([table], kit.ExpTable, device)
 
 
 def _series_snippet(points: int) -> str:

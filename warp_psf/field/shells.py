@@ -4,7 +4,8 @@ A field holds one vector per sample. In an object occlusion field (OOF) it is th
 the part of the sphere of directions that the body covers, projected on SH. In a source radiance field (SRF) it is the
 radiance coefficient vector (RCV): the same with each covered direction weighted by the radiance that leaves the body
 towards the sample. The papers store visibility, 1 minus coverage; coverage holds the same numbers, falls to zero with
-distance and so needs no special care beyond the last shell.
+distance and so needs no special care beyond the last shell. So does the logarithm of visibility, which a log shadow
+field holds.
 """
 
 import math
@@ -15,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_psf.basis import sh, sphere
+from warp_psf.basis import sh, sh_exp, sphere
 
 SHELL_COUNT = 32
 # The radius of shell c is SHELL_SPACING * (1 + c) * (radius of the bounding sphere): Tamura 2006, section 6.
@@ -34,6 +35,11 @@ CONTACT_POWER = 0.5
 HEMISPHERE_SHARE = math.sqrt(4 * math.pi) / (2 * math.pi)
 
 
+def contact_share(order: int, logarithm: bool) -> float:
+    """What the first coefficient of a coverage or of a logarithm is multiplied with for the share of a hemisphere."""
+    return 1.0 / float(sh_exp.cap_logarithm(math.pi / 2, order)[0]) if logarithm else HEMISPHERE_SHARE
+
+
 @dataclass(frozen=True)
 class ShadowField:
     """One body's field, quantised to 8 bits per coefficient.
@@ -43,6 +49,7 @@ class ShadowField:
     resolutions: samples per axis of each shell, R_c, int32 [SHELL_COUNT]; shell c has R_c x R_c samples.
     codes: quantised vectors, shell after shell, rows (theta) before columns (phi), uint8 [samples, coefficients].
     minimum, step: coefficient = minimum + step * code, float32 [SHELL_COUNT, coefficients].
+    logarithm: whether the vectors are those of log_*(visibility) in place of coverage.
     """
 
     center: np.ndarray
@@ -51,6 +58,7 @@ class ShadowField:
     codes: np.ndarray
     minimum: np.ndarray
     step: np.ndarray
+    logarithm: bool = False
 
     @property
     def order(self) -> int:
@@ -184,6 +192,7 @@ def make_fields(order: int) -> SimpleNamespace:
         shell_resolution: wp.array2d(dtype=wp.int32)  # (field, shell)
         center: wp.array(dtype=wp.vec3)  # (field), in the body's frame
         radius: wp.array(dtype=wp.float32)  # (field)
+        contact_share: wp.float32  # see the function of that name
 
     @wp.func_native(_blend_snippet(order))
     def blend(
@@ -199,35 +208,38 @@ def make_fields(order: int) -> SimpleNamespace:
         """The sum of four samples of a shell and four of the next; `minimum` and `step` are those of the field."""
 
     @wp.func
-    def lookup_coverage(table: FieldTable, field: int, p_body: wp.vec3) -> vec:
-        """The vector at a point of the body's frame: bilinear on the two nearest shells, then between them."""
-        offset = p_body - table.center[field]
+    def lookup_coverage(tables: wp.array(dtype=FieldTable), which: int, field: int, p_body: wp.vec3) -> vec:
+        """The vector at a point of the body's frame: bilinear on the two nearest shells, then between them.
+
+        which: of the tables.
+        """
+        offset = p_body - tables[which].center[field]
         distance = wp.length(offset)
         theta, phi = angles_of(offset, distance)
-        radius = distance / (table.radius[field] * wp.static(SHELL_SPACING))
+        radius = distance / (tables[which].radius[field] * wp.static(SHELL_SPACING))
         last = float(wp.static(SHELL_COUNT))
         inner, weight = between_shells(radius, wp.static(SHELL_COUNT))
         near, near_shares = nearest_four(
-            table.shell_first[field, inner], table.shell_resolution[field, inner], theta, phi
+            tables[which].shell_first[field, inner], tables[which].shell_resolution[field, inner], theta, phi
         )
         far, far_shares = nearest_four(
-            table.shell_first[field, inner + 1], table.shell_resolution[field, inner + 1], theta, phi
+            tables[which].shell_first[field, inner + 1], tables[which].shell_resolution[field, inner + 1], theta, phi
         )
         if inner == wp.static(FIRST_OUTER_SHELL):
-            constant = table.minimum[field, inner][0] + table.step[field, inner][0] * (
-                near_shares[0] * float(table.codes[near[0]][0])
-                + near_shares[1] * float(table.codes[near[1]][0])
-                + near_shares[2] * float(table.codes[near[2]][0])
-                + near_shares[3] * float(table.codes[near[3]][0])
+            constant = tables[which].minimum[field, inner][0] + tables[which].step[field, inner][0] * (
+                near_shares[0] * float(tables[which].codes[near[0]][0])
+                + near_shares[1] * float(tables[which].codes[near[1]][0])
+                + near_shares[2] * float(tables[which].codes[near[2]][0])
+                + near_shares[3] * float(tables[which].codes[near[3]][0])
             )
-            share = wp.clamp(wp.static(HEMISPHERE_SHARE) * constant, 0.0, 1.0)
+            share = wp.clamp(tables[which].contact_share * constant, 0.0, 1.0)
             weight = wp.pow(weight, 1.0 - wp.static(CONTACT_POWER) * share)
         beyond = last / wp.max(radius, last)
         scale = beyond * beyond
         return blend(
-            table.codes,
-            table.minimum[field],
-            table.step[field],
+            tables[which].codes,
+            tables[which].minimum[field],
+            tables[which].step[field],
             inner,
             near,
             (scale * (1.0 - weight)) * near_shares,
@@ -256,7 +268,7 @@ def _blend_snippet(order: int) -> str:
 
 
 def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):
-    """A `FieldTable` of `make_fields(order)` with the given fields, in order."""
+    """A `FieldTable` of `make_fields(order)` with the given fields, in order: all of coverage, or all of logarithms."""
     kit = make_fields(order)
     table = kit.FieldTable()
     counts = [field.resolutions.astype(np.int64) ** 2 for field in fields]
@@ -277,6 +289,7 @@ def upload_fields(fields: list[ShadowField], order: int, device: wp.Device):
     centers = np.array([field.center for field in fields], np.float32).reshape(-1, 3)
     table.center = wp.array(centers, dtype=wp.vec3, device=device)
     table.radius = wp.array([field.radius for field in fields], dtype=wp.float32, device=device)
+    table.contact_share = contact_share(order, any(field.logarithm for field in fields))
     return table
 
 
@@ -285,7 +298,7 @@ def lookup(field: ShadowField, points_body: np.ndarray) -> np.ndarray:
     corners = find_corners(field.center, field.radius, field.resolutions, points_body)
     samples = field.dequantised().astype(np.float64)
     nearer, farther = corners.blend(samples)
-    weight = corners.contact_weight(HEMISPHERE_SHARE * nearer[:, 0])[:, None]
+    weight = corners.contact_weight(contact_share(field.order, field.logarithm) * nearer[:, 0])[:, None]
     return corners.scale[:, None] * ((1 - weight) * nearer + weight * farther)
 
 

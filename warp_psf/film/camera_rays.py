@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.scene.camera import Camera
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 
 # Angles are taken this much wider than they come out in float32, so that no body is lost at the rim of a tile.
 TILE_MARGIN = 1.001
@@ -76,7 +76,13 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> float:
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: CameraTable, tiles: TileTable):
+def _fill_tiles(
+    first: int,
+    geometry: GeometryTables,
+    poses: PoseTables,
+    camera: CameraTable,
+    tiles: TileTable,
+):
     world, tile = wp.tid()
     tile += first
     size = float(wp.static(TILE))
@@ -95,11 +101,11 @@ def _fill_tiles(first: int, geometry: GeometryTable, poses: PoseTable, camera: C
     half_angle = wp.static(TILE_MARGIN) * half_angle
     half_width = wp.static(TILE_MARGIN) * half_width
     count = int(0)
-    for entity in range(geometry.entity_mesh.shape[0]):
-        center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
+    for entity in range(geometry[0].entity_mesh.shape[0]):
+        center = poses[0].position[world, entity] + poses[0].rotation[world, entity] * geometry[0].center[entity]
         offset = center - origin
         distance = wp.length(offset)
-        radius = geometry.radius[entity]
+        radius = geometry[0].radius[entity]
         seen = distance <= radius
         if not seen:
             if camera.orthographic[world]:

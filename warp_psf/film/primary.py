@@ -28,7 +28,7 @@ from warp_psf.film.camera_rays import (
 )
 from warp_psf.film.tracing import Hit, opacity_from_behind, surface_of, trace
 from warp_psf.scene.camera import Camera
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable, make_receivers
 from warp_psf.scene.scene import Scene
 
@@ -88,8 +88,8 @@ def store_hit(receivers: ReceiverTable, world: int, slot: int, hit: Hit, weight:
 @wp.kernel(enable_backward=False, module="unique")
 def _trace_centers(
     first: int,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     camera: CameraTable,
     tiles: TileTable,
     back: wp.array(dtype=wp.float32),  # (entity)
@@ -144,7 +144,7 @@ def _add_edges(first: int, camera: CameraTable, receivers: ReceiverTable, edge: 
 
 
 @wp.func
-def group_of(geometry: GeometryTable, entities: wp.vec4i, normals: four_normals, groups: int, hit: Hit) -> int:
+def group_of(geometry: GeometryTables, entities: wp.vec4i, normals: four_normals, groups: int, hit: Hit) -> int:
     """The group of a pixel that a hit belongs to; `groups` where it opens another."""
     found = int(-1)
     for group in range(groups):
@@ -159,11 +159,11 @@ def group_of(geometry: GeometryTable, entities: wp.vec4i, normals: four_normals,
         return groups
     if found < 0:
         # No room for another entity: the first group stands for it that is see-through if it is, else the first.
-        clear = geometry.opacity[hit.entity] < 1.0
+        clear = geometry[0].opacity[hit.entity] < 1.0
         alike = bool(False)
         for group in range(groups):
             if entities[group] >= 0 and not alike:
-                alike = (geometry.opacity[entities[group]] < 1.0) == clear
+                alike = (geometry[0].opacity[entities[group]] < 1.0) == clear
                 if alike or found < 0:
                     found = group
     return found
@@ -172,8 +172,8 @@ def group_of(geometry: GeometryTable, entities: wp.vec4i, normals: four_normals,
 @wp.kernel(enable_backward=False, module="unique")
 def _trace_edges(
     first: int,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     camera: CameraTable,
     tiles: TileTable,
     back: wp.array(dtype=wp.float32),  # (entity)

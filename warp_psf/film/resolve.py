@@ -10,7 +10,7 @@ import warp as wp
 from warp_psf.device import launch
 from warp_psf.film.camera_rays import CameraTable, camera_origin, camera_ray
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, part_of
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.tint import TextureTable, tint_of
 
@@ -63,19 +63,25 @@ def look_up(image: wp.array2d(dtype=wp.vec3), direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def shows_front(receivers: ReceiverTable, world: int, slot: int, geometry: GeometryTable, poses: PoseTable) -> bool:
+def shows_front(
+    receivers: ReceiverTable,
+    world: int,
+    slot: int,
+    geometry: GeometryTables,
+    poses: PoseTables,
+) -> bool:
     """Whether the viewer is on the outer side of the receiver's face: a receiver's normal is turned to the viewer."""
     entity = receivers.entity[world, slot]
-    mesh = geometry.entity_mesh[entity]
-    corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, slot]]
+    mesh = geometry[0].entity_mesh[entity]
+    corners = geometry[0].faces[geometry[0].first_face[mesh] + receivers.face[world, slot]]
     uv = receivers.uv[world, slot]
-    start = geometry.first_vertex[mesh]
+    start = geometry[0].first_vertex[mesh]
     outward = (
-        uv[0] * geometry.normals[start + corners[0]]
-        + uv[1] * geometry.normals[start + corners[1]]
-        + (1.0 - uv[0] - uv[1]) * geometry.normals[start + corners[2]]
+        uv[0] * geometry[0].normals[start + corners[0]]
+        + uv[1] * geometry[0].normals[start + corners[1]]
+        + (1.0 - uv[0] - uv[1]) * geometry[0].normals[start + corners[2]]
     )
-    return wp.dot(poses.rotation[world, entity] * outward, receivers.normal[world, slot]) > 0.0
+    return wp.dot(poses[0].rotation[world, entity] * outward, receivers.normal[world, slot]) > 0.0
 
 
 @wp.func
@@ -97,8 +103,8 @@ def seen_tint(
     pixel: int,
     slot: int,
     receivers: ReceiverTable,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     camera: CameraTable,
     textures: TextureTable,
     part: int,
@@ -109,15 +115,15 @@ def seen_tint(
     n = receivers.normal[world, slot]
     x = float(pixel % camera.width) + 0.5
     y = float(pixel / camera.width) + 0.5
-    longest = wp.static(LONGEST_FOOTPRINT) * geometry.radius[entity]
-    to_entity = wp.transpose(poses.rotation[world, entity])
+    longest = wp.static(LONGEST_FOOTPRINT) * geometry[0].radius[entity]
+    to_entity = wp.transpose(poses[0].rotation[world, entity])
     return tint_of(
         textures,
         geometry,
         entity,
         part,
         receivers.face[world, slot],
-        to_entity * (p - poses.position[world, entity]),
+        to_entity * (p - poses[0].position[world, entity]),
         to_entity * n,
         to_entity * on_plane(camera, world, x + 1.0, y, p, n, longest),
         to_entity * on_plane(camera, world, x, y + 1.0, p, n, longest),
@@ -142,8 +148,8 @@ def _make_resolve(textured: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def resolve_pixels(
         first: int,
-        geometry: GeometryTable,
-        poses: PoseTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
         camera: CameraTable,
         receivers: ReceiverTable,
         extra: wp.array2d(dtype=wp.int32),  # (world, pixel)
@@ -173,14 +179,14 @@ def _make_resolve(textured: bool) -> wp.Kernel:
             if entity >= 0:
                 weight = receivers.weight[world, slot]
                 part = part_of(geometry, entity, receivers.face[world, slot])
-                reflectance = geometry.albedo[part]
-                emission = geometry.emission[part]
+                reflectance = geometry[0].albedo[part]
+                emission = geometry[0].emission[part]
                 if wp.static(textured):
                     if textures.texture[part] >= 0:
                         tint = seen_tint(world, pixel, slot, receivers, geometry, poses, camera, textures, part)
                         reflectance = wp.cw_mul(tint, reflectance)
                         emission = wp.cw_mul(tint, emission)
-                lobe = geometry.specular[entity]
+                lobe = geometry[0].specular[entity]
                 lambert = reflectance * wp.static(1.0 / math.pi)
                 light += weight * (wp.cw_mul(lambert, diffuse[world, slot]) + wp.cw_mul(lobe, glossy[world, slot]))
                 bounced += weight * (
@@ -208,7 +214,7 @@ def _make_resolve(textured: bool) -> wp.Kernel:
         if entity >= 0:
             depth = receivers.depth[world, pixel]
             part = part_of(geometry, entity, receivers.face[world, pixel])
-            objects = wp.vec2i(geometry.object_id[part], geometry.object_type[part])
+            objects = wp.vec2i(geometry[0].object_id[part], geometry[0].object_type[part])
         layers.depth[world, pixel] = depth
         layers.segmentation[world, pixel] = objects
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_psf.film.camera_rays import CameraTable, TileTable
 from warp_psf.scene.camera import Camera
-from warp_psf.scene.geometry import GeometryTable, PoseTable, may_hit
+from warp_psf.scene.geometry import GeometryTables, PoseTables, may_hit
 from warp_psf.scene.light import area_light_entities
 from warp_psf.scene.scene import Poses, Scene
 
@@ -71,7 +71,7 @@ class Sight:
 
 @wp.func
 def next_face(
-    geometry: GeometryTable,
+    geometry: GeometryTables,
     entity: int,
     shows_back: bool,
     origin: wp.vec3,
@@ -87,7 +87,10 @@ def next_face(
     passed = int(0)
     while passed < wp.static(MOST_PASSED):
         query = wp.mesh_query_ray(
-            geometry.mesh_id[geometry.entity_mesh[entity]], origin + begin * direction, direction, farthest - begin
+            geometry[0].mesh_id[geometry[0].entity_mesh[entity]],
+            origin + begin * direction,
+            direction,
+            farthest - begin,
         )
         passed += 1
         if not query.result:
@@ -97,7 +100,7 @@ def next_face(
         elif query.sign < 0.0 and not shows_back:
             begin += query.t
             begin += wp.static(STEP) * (begin + wp.length(origin))
-            if geometry.convex[entity]:
+            if geometry[0].convex[entity]:
                 passed = wp.static(MOST_PASSED)
         else:
             found.face = query.face
@@ -136,8 +139,8 @@ def add_pane(sight: Sight, entity: int, found: Face, opacity: float) -> Sight:
 
 @wp.func
 def trace(
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     camera: CameraTable,
     tiles: TileTable,
     back: wp.array(dtype=wp.float32),  # (entity)
@@ -154,11 +157,11 @@ def trace(
     length_squared = wp.dot(direction, direction)
     for place in range(tiles.count[world, tile]):
         entity = tiles.entity[world, tile, place]
-        position = poses.position[world, entity]
-        rotation = poses.rotation[world, entity]
-        to_center = position + rotation * geometry.center[entity] - origin
+        position = poses[0].position[world, entity]
+        rotation = poses[0].rotation[world, entity]
+        to_center = position + rotation * geometry[0].center[entity] - origin
         along = wp.dot(to_center, direction)
-        radius = geometry.radius[entity]
+        radius = geometry[0].radius[entity]
         # Discriminant of the ray against the bounding sphere, and whether the sphere lies ahead and near enough.
         beside = to_center - (along / length_squared) * direction
         reach = length_squared * (radius * radius - wp.dot(beside, beside))
@@ -173,20 +176,13 @@ def trace(
                     crossed = int(0)
                     while crossed < wp.static(PANES):
                         found = next_face(
-                            geometry,
-                            entity,
-                            back[entity] > 0.0,
-                            origin_entity,
-                            direction_entity,
-                            start,
-                            near,
-                            nearest,
+                            geometry, entity, back[entity] > 0.0, origin_entity, direction_entity, start, near, nearest
                         )
                         crossed += 1
                         if found.face < 0:
                             crossed = wp.static(PANES)
                         else:
-                            opacity = geometry.opacity[entity]
+                            opacity = geometry[0].opacity[entity]
                             if found.from_behind:
                                 opacity *= back[entity]
                             if opacity < 1.0:
@@ -208,8 +204,8 @@ def trace(
 
 @wp.func
 def surface_of(
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     world: int,
     sight: Sight,
     place: int,
@@ -237,15 +233,15 @@ def surface_of(
         from_behind = sight.solid.from_behind
     if hit.entity >= 0:
         hit.position = origin + hit.distance * direction
-        mesh = geometry.entity_mesh[hit.entity]
-        corners = geometry.faces[geometry.first_face[mesh] + hit.face]
-        start = geometry.first_vertex[mesh]
+        mesh = geometry[0].entity_mesh[hit.entity]
+        corners = geometry[0].faces[geometry[0].first_face[mesh] + hit.face]
+        start = geometry[0].first_vertex[mesh]
         smooth = (
-            hit.u * geometry.normals[start + corners[0]]
-            + hit.v * geometry.normals[start + corners[1]]
-            + (1.0 - hit.u - hit.v) * geometry.normals[start + corners[2]]
+            hit.u * geometry[0].normals[start + corners[0]]
+            + hit.v * geometry[0].normals[start + corners[1]]
+            + (1.0 - hit.u - hit.v) * geometry[0].normals[start + corners[2]]
         )
-        normal = wp.normalize(poses.rotation[world, hit.entity] * smooth)
+        normal = wp.normalize(poses[0].rotation[world, hit.entity] * smooth)
         hit.normal = wp.where(from_behind, -normal, normal)
     return hit
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.device import upload_tables
 from warp_psf.scene.loose import Loose
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Poses, Scene
@@ -46,33 +47,38 @@ class PoseTable:
     rotation: wp.array2d(dtype=wp.mat33)  # (world, entity), world_from_entity
 
 
+# What kernels and device functions take: arrays of one table (see `device.upload_tables`).
+GeometryTables = wp.array(dtype=GeometryTable)
+PoseTables = wp.array(dtype=PoseTable)
+
+
 @wp.func
-def may_hit(geometry: GeometryTable, entity: int, origin: wp.vec3, direction: wp.vec3, farthest: float) -> bool:
+def may_hit(geometry: GeometryTables, entity: int, origin: wp.vec3, direction: wp.vec3, farthest: float) -> bool:
     """Whether a ray in the entity's frame meets its bounding box before `farthest`, in units of `direction`."""
     # Division by zero gives infinities of the right sign. The box counts as a millionth deeper than it is, so that
     # rounding loses no hit on its faces.
-    near = wp.cw_div(geometry.lower[entity] - origin, direction)
-    far = wp.cw_div(geometry.upper[entity] - origin, direction)
+    near = wp.cw_div(geometry[0].lower[entity] - origin, direction)
+    far = wp.cw_div(geometry[0].upper[entity] - origin, direction)
     enter = wp.max(wp.min(near, far))
     leave = wp.min(wp.max(near, far)) * 1.000001
     return not (leave < wp.max(enter, 0.0) or enter > farthest)
 
 
 @wp.func
-def part_of(geometry: GeometryTable, entity: int, face: int) -> int:
+def part_of(geometry: GeometryTables, entity: int, face: int) -> int:
     """The part that a face of an entity's mesh belongs to."""
-    part = geometry.first_part[entity]
-    if geometry.first_face_part[entity] >= 0:
-        part += geometry.face_part[geometry.first_face_part[entity] + face]
+    part = geometry[0].first_part[entity]
+    if geometry[0].first_face_part[entity] >= 0:
+        part += geometry[0].face_part[geometry[0].first_face_part[entity] + face]
     return part
 
 
 @dataclass(frozen=True)
 class DeviceScene:
-    """The scene's tables, and the Warp meshes that must live as long as `geometry` names them."""
+    """The scene's tables, as arrays of one, and the Warp meshes that must live as long as `geometry` names them."""
 
-    geometry: GeometryTable
-    poses: PoseTable
+    geometry: wp.array  # of GeometryTable
+    poses: wp.array  # of PoseTable
     meshes: list[wp.Mesh]
 
 
@@ -114,7 +120,7 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     poses = PoseTable()
     poses.position = wp.zeros((worlds, len(scene.entities)), dtype=wp.vec3, device=device)
     poses.rotation = wp.zeros((worlds, len(scene.entities)), dtype=wp.mat33, device=device)
-    return DeviceScene(table, poses, meshes)
+    return DeviceScene(upload_tables([table], GeometryTable, device), upload_tables([poses], PoseTable, device), meshes)
 
 
 def _upload_parts(table: GeometryTable, scene: Scene, device: wp.Device) -> None:
@@ -137,13 +143,14 @@ def _upload_parts(table: GeometryTable, scene: Scene, device: wp.Device) -> None
 
 def write_poses(device_scene: DeviceScene, poses: Poses) -> None:
     """Brings the poses of a frame to the device."""
-    device_scene.poses.position.assign(poses.position)
-    device_scene.poses.rotation.assign(poses.rotation)
+    (table,) = device_scene.poses.tables
+    table.position.assign(poses.position)
+    table.rotation.assign(poses.rotation)
 
 
 def write_loose(device_scene: DeviceScene, scene: Scene, loose: Loose | None) -> None:
     """Brings the present shape of the scene's loose entity to the device; None leaves nothing of it."""
-    table, entity = device_scene.geometry, scene.loose
+    (table,), entity = device_scene.geometry.tables, scene.loose
     mesh = scene.entities[entity].mesh
     # A box that is inside out is hit by nothing.
     lower, upper, center, radius = np.full(3, 1e30), np.full(3, -1e30), np.zeros(3), 0.0

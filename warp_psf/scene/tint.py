@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_psf.scene.geometry import GeometryTable
+from warp_psf.scene.geometry import GeometryTables
 from warp_psf.scene.scene import Scene
 from warp_psf.scene.texture import DECODED, LINEAR, Texture, Wrap, decode, encode, halve
 
@@ -254,14 +254,14 @@ def nearest_turn(step: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def given_place(table: TextureTable, geometry: GeometryTable, entity: int, face: int, p: wp.vec3) -> wp.vec2:
+def given_place(table: TextureTable, geometry: GeometryTables, entity: int, face: int, p: wp.vec3) -> wp.vec2:
     """The coordinates that a mesh brings, at a point of the plane of a face, which may lie beyond it."""
-    mesh = geometry.entity_mesh[entity]
-    corners = geometry.faces[geometry.first_face[mesh] + face]
-    start = geometry.first_vertex[mesh]
-    a = geometry.vertices[start + corners[0]]
-    ab = geometry.vertices[start + corners[1]] - a
-    ac = geometry.vertices[start + corners[2]] - a
+    mesh = geometry[0].entity_mesh[entity]
+    corners = geometry[0].faces[geometry[0].first_face[mesh] + face]
+    start = geometry[0].first_vertex[mesh]
+    a = geometry[0].vertices[start + corners[0]]
+    ab = geometry[0].vertices[start + corners[1]] - a
+    ac = geometry[0].vertices[start + corners[2]] - a
     normal = wp.cross(ab, ac)
     squared = wp.max(wp.length_sq(normal), 1.0e-30)
     u = wp.dot(wp.cross(p - a, ac), normal) / squared
@@ -273,7 +273,7 @@ def given_place(table: TextureTable, geometry: GeometryTable, entity: int, face:
 @wp.func
 def tint_of(
     table: TextureTable,
-    geometry: GeometryTable,
+    geometry: GeometryTables,
     entity: int,
     part: int,
     face: int,

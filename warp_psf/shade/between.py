@@ -13,11 +13,11 @@ import warp as wp
 
 from warp_psf.basis import sh
 from warp_psf.basis.directions import sum_in_lanes
-from warp_psf.scene.geometry import GeometryTable, PoseTable
+from warp_psf.scene.geometry import GeometryTables, PoseTables
 from warp_psf.shade.area import make_area
 from warp_psf.shade.direct import legendre_series
 from warp_psf.shade.occlude import make_occlude
-from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
+from warp_psf.shade.patches import PatchTables, slab_from_world, slab_origin
 from warp_psf.shade.relations import faces_ahead
 
 # As many bodies send light to a receiver at once; where there are more, those that take up least of its view fade out.
@@ -44,7 +44,7 @@ def overlap(toward: wp.vec3, sine: float, other_toward: wp.vec3, other_sine: flo
 def make_between(order: int) -> SimpleNamespace:
     """Device functions for `order` bands: `find_sources`, and the type `lists` of the sources' coverages."""
     kit = make_occlude(order)
-    Occlusion = kit.Occlusion
+    OcclusionTables = kit.OcclusionTables
     lists = wp.types.matrix((MOST_SOURCES, kit.points), wp.float32)
     values, half_values = kit.values, kit.half_values
     area = make_area(order)
@@ -76,15 +76,15 @@ def make_between(order: int) -> SimpleNamespace:
 
     @wp.func
     def share_of(
-        world: int, entity: int, p: wp.vec3, geometry: GeometryTable, poses: PoseTable, patches: PatchTable
+        world: int, entity: int, p: wp.vec3, geometry: GeometryTables, poses: PoseTables, patches: PatchTables
     ) -> float:
         """About how much of the view a body takes up: (radius / distance)^2, for slabs to their nearest point."""
-        radius = geometry.radius[entity]
-        center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
+        radius = geometry[0].radius[entity]
+        center = poses[0].position[world, entity] + poses[0].rotation[world, entity] * geometry[0].center[entity]
         squared = wp.length_sq(center - p)
-        if patches.first_face[entity] >= 0:
+        if patches[0].first_face[entity] >= 0:
             p_slab = slab_from_world(world, entity, poses, patches) * (p - slab_origin(world, entity, poses, patches))
-            half = patches.slab_half[entity]
+            half = patches[0].slab_half[entity]
             outside = wp.max(wp.vec3(wp.abs(p_slab[0]), wp.abs(p_slab[1]), wp.abs(p_slab[2])) - half, wp.vec3())
             squared = wp.length_sq(outside)
         return radius * radius / wp.max(squared, 1.0e-12)
@@ -97,16 +97,16 @@ def make_between(order: int) -> SimpleNamespace:
         p: wp.vec3,
         n: wp.vec3,
         threshold: float,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        patches: PatchTable,
-        o: Occlusion,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        patches: PatchTables,
+        o: OcclusionTables,
     ) -> float:
         """How far a body matters to a receiver: those that take up less of its view than `threshold` do not."""
-        rotation = poses.rotation[world, entity]
-        center = poses.position[world, entity] + rotation * geometry.center[entity]
-        weight = kit.matters(entity, own, p, n, center, geometry.radius[entity], rotation, o)
-        if weight > 0.0 and patches.first_face[entity] < 0:
+        rotation = poses[0].rotation[world, entity]
+        center = poses[0].position[world, entity] + rotation * geometry[0].center[entity]
+        weight = kit.matters(entity, own, p, n, center, geometry[0].radius[entity], rotation, o)
+        if weight > 0.0 and patches[0].first_face[entity] < 0:
             share = share_of(world, entity, p, geometry, poses, patches)
             weight *= wp.clamp(share / threshold - 1.0, 0.0, 1.0)
         return weight
@@ -118,14 +118,14 @@ def make_between(order: int) -> SimpleNamespace:
         p: wp.vec3,
         n: wp.vec3,
         threshold: float,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        patches: PatchTable,
-        o: Occlusion,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        patches: PatchTables,
+        o: OcclusionTables,
     ) -> Sources:
         """The bodies that can send light to a receiver of the entity `own` at p with normal n."""
         sources = Sources()
-        entities = geometry.entity_mesh.shape[0]
+        entities = geometry[0].entity_mesh.shape[0]
         smallest = float(0.0)
         if entities - 1 > wp.static(MOST_SOURCES):
             # The share of the first body for which there is no room; towards it the others fade.
@@ -147,14 +147,16 @@ def make_between(order: int) -> SimpleNamespace:
                 weight *= wp.clamp(share / smallest - 1.0, 0.0, 1.0)
             if weight > 0.0 and sources.count < wp.static(MOST_SOURCES):
                 place = sources.count
-                offset = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity] - p
+                offset = (
+                    poses[0].position[world, entity] + poses[0].rotation[world, entity] * geometry[0].center[entity] - p
+                )
                 distance = wp.max(wp.length(offset), 1.0e-9)
                 sources.entity[place] = entity
                 sources.weight[place] = weight
                 sources.toward[place] = offset / distance
                 sources.distance[place] = distance
-                sources.radius[place] = geometry.radius[entity]
-                sources.sine[place] = wp.min(geometry.radius[entity] / distance, 1.0)
+                sources.radius[place] = geometry[0].radius[entity]
+                sources.sine[place] = wp.min(geometry[0].radius[entity] / distance, 1.0)
                 sources.ahead[place] = faces_ahead(world, entity, p, poses, patches)
                 sources.count = place + 1
         return sources
@@ -180,12 +182,7 @@ def make_between(order: int) -> SimpleNamespace:
         return wp.clamp(exact / wp.max(limited, 1.0e-9), 0.0, wp.static(MOST_GAIN))
 
     return SimpleNamespace(
-        **vars(kit),
-        lists=lists,
-        numbers=numbers,
-        Sources=Sources,
-        find_sources=find_sources,
-        horizon_gain=horizon_gain,
+        **vars(kit), lists=lists, numbers=numbers, Sources=Sources, find_sources=find_sources, horizon_gain=horizon_gain
     )
 
 

@@ -19,15 +19,15 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.field.radiance import SummedFields
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, part_of
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, part_of
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import make_between, overlap
 from warp_psf.shade.direct import DirectState
 from warp_psf.shade.gloss import GlossState, make_gloss
-from warp_psf.shade.occlude import OcclusionState
+from warp_psf.shade.occluders import OcclusionState
 from warp_psf.shade.patches import (
     Patches,
-    PatchTable,
+    PatchTables,
     block_of,
     build_pyramids,
     place_texels,
@@ -44,18 +44,19 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
     between = make_between(order)
     patch, radiant, values = kit.patch, kit.radiant, kit.values
     per_function = radiant.weights
-    Occlusion, Lighting, RadianceTable = kit.Occlusion, kit.Lighting, radiant.RadianceTable
+    OcclusionTables, LightingTables = kit.OcclusionTables, kit.LightingTables
+    RadianceTable = radiant.RadianceTable
     BodyTable, KeptTable, GlossTable = kit.BodyTable, kit.KeptTable, kit.GlossTable
 
     @wp.kernel(enable_backward=False, module="unique")
     def gather_basis(
         first: int,
         proxies: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        lighting: Lighting,
-        patches: PatchTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
+        patches: PatchTables,
         relations: RelationTable,
         fields: RadianceTable,
         bodies: BodyTable,
@@ -72,8 +73,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             return
         surface = kit.surface_of(world, proxy, proxies, geometry, poses, lighting)
         p = surface.position
-        transfer = kit.transfer_of(surface, o.rows[world, own], lighting, o)
-        transfer = wp.cw_mul(transfer, lighting.weights[0])
+        transfer = kit.transfer_of(surface, o[0].rows[world, own], lighting, o)
+        transfer = wp.cw_mul(transfer, lighting[0].weights[0])
         sources = between.find_sources(world, own, p, surface.normal, threshold, geometry, poses, patches, o)
         entity_at = sources.entity
         weight = sources.weight
@@ -86,10 +87,10 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         covers = between.lists()
         gain = between.numbers()
         for place in range(sources.count):
-            covered = kit.covered_by(world, entity_at[place], p, geometry, poses, o)
+            covered = kit.covered_around(world, entity_at[place], p, geometry, poses, o)
             covers[place] = weight[place] * covered
             open_to = wp.cw_mul(open_to, values(1.0) - covers[place])
-            gain[place] = between.horizon_gain(covered, surface.normal, lighting.weights[0], o.quadrature)
+            gain[place] = between.horizon_gain(covered, surface.normal, lighting[0].weights[0], o[0].quadrature)
         count = int(0)
         faces = int(0)
         for place in range(sources.count):
@@ -107,23 +108,25 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                             )
                         if share > 0.0:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
+                p_body = wp.transpose(poses[0].rotation[world, source]) * (p - poses[0].position[world, source])
                 where = radiant.locate(fields, bodies.field[source], p_body)
                 light = gain[place] * wp.cw_mul(passed, weighted)
-                rows = o.rows[world, source]
+                rows = o[0].rows[world, source]
                 kept.entity[world, station, count] = source
                 kept.irradiance[world, station, count] = radiant.basis_irradiance(
                     fields, where, kit.project(light, rows)
                 )
-                kit.keep_moments(world, station, count, proxy, source, light, rows, o.quadrature, fields, where, gloss)
+                kit.keep_moments(
+                    world, station, count, proxy, source, light, rows, o[0].quadrature, fields, where, gloss
+                )
                 count += 1
-            elif patches.first_face[source] >= 0:
+            elif patches[0].first_face[source] >= 0:
                 to_slab = slab_from_world(world, source, poses, patches)
                 p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
                 for side in range(6):
-                    face = patches.first_face[source] + side
+                    face = patches[0].first_face[source] + side
                     if patch.sees_face(world, face, p_slab, patches) and faces < kept.face.shape[2]:
-                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o.quadrature)
+                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o[0].quadrature)
                         for other in range(sources.count):
                             if other != place:
                                 share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
@@ -137,7 +140,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             block = block_of(proxy - first_texel, patches)
             for y in range(block[3]):
                 for x in range(block[2]):
-                    patches.openness[world, block[0] + y * block[1] + x] = openness
+                    patches[0].openness[world, block[0] + y * block[1] + x] = openness
         kept.count[world, station] = count
         kept.face_count[world, station] = faces
 
@@ -145,7 +148,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
     def leave_surface(
         first: int,
         proxies: ReceiverTable,
-        geometry: GeometryTable,
+        geometry: GeometryTables,
         irradiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         tint: wp.array2d(dtype=wp.vec3),  # (world, proxy)
         gloss: GlossTable,
@@ -158,9 +161,9 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         radiance = wp.vec3()
         if entity >= 0:
             part = part_of(geometry, entity, proxies.face[world, proxy])
-            albedo = wp.cw_mul(tint[world, proxy], geometry.albedo[part])
-            shine = wp.cw_mul(tint[world, proxy], geometry.emission[part])
-            reflectance = albedo + geometry.specular[entity]
+            albedo = wp.cw_mul(tint[world, proxy], geometry[0].albedo[part])
+            shine = wp.cw_mul(tint[world, proxy], geometry[0].emission[part])
+            reflectance = albedo + geometry[0].specular[entity]
             radiance = shine + wp.cw_mul(reflectance, irradiance[world, proxy]) / wp.pi
             if gloss.place[proxy] >= 0:
                 radiance = shine + kit.leave_glossy(
@@ -180,10 +183,10 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
     def bounce_light(
         first: int,
         proxies: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        patches: PatchTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        patches: PatchTables,
         bodies: BodyTable,
         kept: KeptTable,
         tint: wp.array2d(dtype=wp.vec3),  # (world, proxy)
@@ -207,18 +210,18 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             irradiance += kit.light_of(world, source, kept.irradiance[world, station, place], bodies)
         for place in range(kept.face_count[world, station]):
             seen = kept.face[world, station, place]
-            slab = patches.entity[seen]
+            slab = patches[0].entity[seen]
             to_slab = slab_from_world(world, slab, poses, patches)
             p_slab = to_slab * (proxies.position[world, proxy] - slab_origin(world, slab, poses, patches))
-            shown = patch.face_radiance(world, seen, p_slab, normal, to_slab, patches, o.quadrature)
+            shown = patch.face_radiance(world, seen, p_slab, normal, to_slab, patches, o[0].quadrature)
             irradiance += kit.sum_rgb(kept.transport[world, station, place], shown)
         if bodies.field[own] >= 0:
             irradiance += kit.light_of(world, own, bodies.own[proxy], bodies)
-        plain = geometry.albedo[part_of(geometry, own, proxies.face[world, proxy])]
+        plain = geometry[0].albedo[part_of(geometry, own, proxies.face[world, proxy])]
         irradiance = wp.max(irradiance, wp.vec3())
         if proxy < first_texel:
             albedo = wp.cw_mul(tint[world, proxy], plain)
-            radiance = wp.cw_mul(albedo + geometry.specular[own], irradiance) / wp.pi
+            radiance = wp.cw_mul(albedo + geometry[0].specular[own], irradiance) / wp.pi
             if gloss.place[proxy] >= 0:
                 radiance = kit.leave_glossy(world, gloss.place[proxy], own, normal, irradiance, albedo, geometry, gloss)
             radiance_out[world, proxy] = radiance
@@ -229,7 +232,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             for x in range(block[2]):
                 texel = first_texel + block[0] + y * block[1] + x
                 albedo = wp.cw_mul(tint[world, texel], plain)
-                radiance = wp.cw_mul(albedo + geometry.specular[own], irradiance) / wp.pi
+                radiance = wp.cw_mul(albedo + geometry[0].specular[own], irradiance) / wp.pi
                 radiance_out[world, texel] = radiance
                 total_out[world, texel] = total_out[world, texel] + radiance
 
@@ -284,7 +287,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
 @wp.kernel(enable_backward=False, module="unique")
 def _place_proxies(
     first: int,
-    poses: PoseTable,
+    poses: PoseTables,
     entities: wp.array(dtype=wp.int32),  # (body proxy)
     points: wp.array(dtype=wp.vec3),  # (body proxy), in the entity's frame
     normals: wp.array(dtype=wp.vec3),  # (body proxy)
@@ -293,9 +296,9 @@ def _place_proxies(
     world, proxy = wp.tid()
     proxy += first
     entity = entities[proxy]
-    rotation = poses.rotation[world, entity]
+    rotation = poses[0].rotation[world, entity]
     proxies.entity[world, proxy] = entity
-    proxies.position[world, proxy] = poses.position[world, entity] + rotation * points[proxy]
+    proxies.position[world, proxy] = poses[0].position[world, entity] + rotation * points[proxy]
     proxies.normal[world, proxy] = rotation * normals[proxy]
 
 
@@ -354,7 +357,7 @@ def gather_basis_irradiances(
     launch(_place_proxies, (worlds, state.first_texel), inputs, [], device)
     place_texels(state.patches, scene, state.proxies, state.first_texel, device)
     relate(state.relations, state.patches, scene, device)
-    tables = [scene.geometry, scene.poses, occlusion.table, lighting.table, state.patches.table, state.relations]
+    tables = [scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.patches.tables, state.relations]
     inputs = [state.proxies, *tables, state.fields, state.bodies, state.gloss.table, threshold, state.first_texel]
     launch(kit.gather_basis, state.kept.count.shape, inputs, [state.kept], device)
 
@@ -372,7 +375,15 @@ def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, ti
     launch(kit.leave_surface, shape, inputs, outputs, device)
     for _ in range(times - 1):
         _represent(state, state.radiance, gloss.table.vector, device)
-        inputs = [state.proxies, scene.geometry, scene.poses, occlusion.table, patches.table, state.bodies, state.kept]
+        inputs = [
+            state.proxies,
+            scene.geometry,
+            scene.poses,
+            occlusion.tables,
+            patches.tables,
+            state.bodies,
+            state.kept,
+        ]
         launch(kit.add_gloss, gloss.table.extra.shape, [state.bodies, state.kept, gloss.table], [], device)
         launch(kit.gather_moments, gloss.table.vector.shape, [*inputs, gloss.table], [], device)
         inputs += [state.tint, gloss.table, state.first_texel]

@@ -1,7 +1,7 @@
 """Coverage: which part of the directions around a point an entity takes up, at the directions of a quadrature.
 
 Where coverage has a closed form it is used: spheres (zonal), boxes and rectangles (spherical polygons). The others
-are looked up in their shadow fields. All give the projection on `order` bands, evaluated at the directions.
+are looked up in their shadow fields. All are the projection on `order` bands, evaluated at the directions.
 """
 
 from functools import cache
@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_psf.basis.directions import make_directions
-from warp_psf.field.shells import make_fields
 from warp_psf.shade.slab import make_slab
 
 NO_SHAPE, FIELD_SHAPE, SPHERE_SHAPE, SLAB_SHAPE = 0, 1, 2, 3
@@ -21,11 +20,9 @@ SLAB_SKIN = 1.0e-5
 
 @cache
 def make_coverage(order: int) -> SimpleNamespace:
-    """Device functions for `order` bands: those of `make_directions`, and `coverage_of` with its table."""
+    """Device functions for `order` bands: those of `make_directions`, the closed forms, and the occluders' table."""
     kit = make_directions(order)
-    fields = make_fields(order)
     values, half_values, profile = kit.values, kit.half_values, kit.profile
-    FieldTable = fields.FieldTable
     silhouette_coverage = make_slab(order)
 
     @wp.struct
@@ -85,41 +82,9 @@ def make_coverage(order: int) -> SimpleNamespace:
         pole = wp.normalize(nearest - p)
         return silhouette_coverage(p, half, pole, to_world, quadrature)
 
-    @wp.func
-    def coverage_of(
-        entity: int,
-        p_world: wp.vec3,
-        position: wp.vec3,
-        rotation: wp.mat33,
-        center: wp.vec3,
-        radius: float,
-        occluders: OccluderTable,
-        table: FieldTable,
-        rows: wp.array(dtype=half_values),
-        quadrature: wp.array(dtype=half_values),
-    ) -> values:
-        """The part of the directions around p_world that `entity` covers: 1 where it does, 0 elsewhere."""
-        shape = occluders.shape[entity]
-        if shape == wp.static(FIELD_SHAPE):
-            p_body = wp.transpose(rotation) * (p_world - position)
-            return kit.at_directions(fields.lookup_coverage(table, occluders.field[entity], p_body), rows)
-        if shape == wp.static(SPHERE_SHAPE):
-            offset = position + rotation * center - p_world
-            distance = wp.length(offset)
-            # Inside, by contact, counts as on the surface.
-            sine = wp.min(radius / wp.max(distance, 1.0e-9), 1.0)
-            return cap_coverage(offset / wp.max(distance, 1.0e-9), sine, quadrature)
-        if shape == wp.static(SLAB_SHAPE):
-            to_world = rotation * occluders.slab_rotation[entity]
-            p_slab = wp.transpose(to_world) * (p_world - position - rotation * occluders.slab_center[entity])
-            return slab_coverage(p_slab, occluders.slab_half[entity], to_world, quadrature)
-        return values()
-
     return SimpleNamespace(
         **vars(kit),
-        FieldTable=FieldTable,
         OccluderTable=OccluderTable,
         cap_coverage=cap_coverage,
         slab_coverage=slab_coverage,
-        coverage_of=coverage_of,
     )

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_psf.basis import sphere
 from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable, may_hit
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, may_hit
 from warp_psf.scene.light import DeltaLight
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
@@ -60,8 +60,8 @@ def find_in_the_way(
     p: wp.vec3,
     toward: wp.vec3,
     spread: float,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     opacity: wp.array(dtype=wp.float32),  # (entity)
     shadows_itself: wp.array(dtype=wp.bool),  # (entity)
 ) -> InTheWay:
@@ -70,10 +70,12 @@ def find_in_the_way(
     found.listed = True
     length_squared = wp.dot(toward, toward)
     length = wp.sqrt(length_squared)
-    for entity in range(geometry.entity_mesh.shape[0]):
+    for entity in range(geometry[0].entity_mesh.shape[0]):
         if opacity[entity] > 0.0 and (entity != own or shadows_itself[entity]):
-            radius = geometry.radius[entity]
-            to_center = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity] - p
+            radius = geometry[0].radius[entity]
+            to_center = (
+                poses[0].position[world, entity] + poses[0].rotation[world, entity] * geometry[0].center[entity] - p
+            )
             nearest = wp.clamp(wp.dot(to_center, toward) / length_squared, 0.0, 1.0)
             # The cone where it leaves the entity's sphere is as wide as it gets there.
             reach = radius + spread * wp.min(nearest + radius / length, 1.0)
@@ -84,7 +86,7 @@ def find_in_the_way(
                 else:
                     found.listed = False
     if not found.listed:
-        found.count = geometry.entity_mesh.shape[0]
+        found.count = geometry[0].entity_mesh.shape[0]
     return found
 
 
@@ -95,8 +97,8 @@ def share_passed(
     p: wp.vec3,
     toward: wp.vec3,
     found: InTheWay,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     opacity: wp.array(dtype=wp.float32),  # (entity)
     shadows_itself: wp.array(dtype=wp.bool),  # (entity)
 ) -> float:
@@ -108,10 +110,10 @@ def share_passed(
         if found.listed:
             entity = found.entity[place]
         if found.listed or (opacity[entity] > 0.0 and (entity != own or shadows_itself[entity])):
-            position = poses.position[world, entity]
-            rotation = poses.rotation[world, entity]
-            radius = geometry.radius[entity]
-            to_center = position + rotation * geometry.center[entity] - p
+            position = poses[0].position[world, entity]
+            rotation = poses[0].rotation[world, entity]
+            radius = geometry[0].radius[entity]
+            to_center = position + rotation * geometry[0].center[entity] - p
             # The point of the segment that is nearest to the centre.
             nearest = wp.clamp(wp.dot(to_center, toward) / length_squared, 0.0, 1.0)
             if wp.length_sq(to_center - nearest * toward) < radius * radius:
@@ -119,7 +121,7 @@ def share_passed(
                 start = inverse * (p - position)
                 way = inverse * toward
                 if may_hit(geometry, entity, start, way, 1.0):
-                    if wp.mesh_query_ray_anyhit(geometry.mesh_id[geometry.entity_mesh[entity]], start, way, 1.0):
+                    if wp.mesh_query_ray_anyhit(geometry[0].mesh_id[geometry[0].entity_mesh[entity]], start, way, 1.0):
                         passed *= 1.0 - opacity[entity]
                         if passed <= 0.0:
                             return 0.0
@@ -141,8 +143,8 @@ def delta_light(
     entity: int,
     p: wp.vec3,
     n: wp.vec3,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     opacity: wp.array(dtype=wp.float32),  # (entity)
     lights: DeltaLightTable,
     far: float,
@@ -153,7 +155,7 @@ def delta_light(
     """
     origin = p
     if lights.shadows_itself[entity]:
-        origin = p + (wp.static(SHADOW_OFFSET) * geometry.radius[entity]) * n
+        origin = p + (wp.static(SHADOW_OFFSET) * geometry[0].radius[entity]) * n
     kind = lights.kind[world, light]
     toward = -far * lights.direction[world, light]
     strength = float(1.0)
@@ -207,8 +209,8 @@ def delta_light(
 def _add_delta_lights(
     first: int,
     receivers: ReceiverTable,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     opacity: wp.array(dtype=wp.float32),  # (entity)
     eye: wp.array(dtype=wp.vec3),  # (world)
     lights: DeltaLightTable,
@@ -223,7 +225,7 @@ def _add_delta_lights(
         return
     n = receivers.normal[world, receiver]
     p = receivers.position[world, receiver]
-    exponent = geometry.exponent[entity]
+    exponent = geometry[0].exponent[entity]
     view = wp.normalize(eye[world] - p)
     mirrored = 2.0 * wp.dot(n, view) * n - view
     diffuse = wp.vec3()

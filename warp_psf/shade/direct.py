@@ -10,13 +10,14 @@ import warp as wp
 
 from warp_psf.basis import sh
 from warp_psf.basis.directions import basis_at_directions, quadrature_weights
-from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.device import launch, upload_tables
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.area import make_area
-from warp_psf.shade.occlude import OcclusionState, make_occlude
+from warp_psf.shade.occlude import make_occlude
+from warp_psf.shade.occluders import OcclusionState
 
 
 @cache
@@ -24,7 +25,7 @@ def make_direct(order: int) -> SimpleNamespace:
     """The kernel and tables of direct light on `order` bands."""
     kit = make_occlude(order)
     vec, values, half_values = kit.vec, kit.values, kit.half_values
-    Occlusion = kit.Occlusion
+    OcclusionTables = kit.OcclusionTables
     area = make_area(order)
     profile = kit.profile
     # The closed forms of the transfer are not stored, so they may have a band more than the fields: the clamped
@@ -47,6 +48,8 @@ def make_direct(order: int) -> SimpleNamespace:
         first_transfer: wp.array(dtype=wp.int32)  # (entity): -1 for convex bodies
         lobe: wp.array(dtype=profile)  # (entity): Phong lobe, coefficients of Legendre polynomials
 
+    LightingTables = wp.array(dtype=Lighting)
+
     @wp.struct
     class Surface:
         """A receiver with what shading it needs to know of the surface it lies on."""
@@ -64,29 +67,29 @@ def make_direct(order: int) -> SimpleNamespace:
         world: int,
         receiver: int,
         receivers: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        lighting: Lighting,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        lighting: LightingTables,
     ) -> Surface:
         surface = Surface()
         entity = receivers.entity[world, receiver]
-        mesh = geometry.entity_mesh[entity]
+        mesh = geometry[0].entity_mesh[entity]
         surface.entity = entity
         surface.position = receivers.position[world, receiver]
         surface.normal = receivers.normal[world, receiver]
-        surface.corners = geometry.faces[geometry.first_face[mesh] + receivers.face[world, receiver]]
+        surface.corners = geometry[0].faces[geometry[0].first_face[mesh] + receivers.face[world, receiver]]
         surface.uv = receivers.uv[world, receiver]
-        surface.first_transfer = lighting.first_transfer[entity]
+        surface.first_transfer = lighting[0].first_transfer[entity]
         if surface.first_transfer >= 0:
-            vertex = geometry.first_vertex[mesh]
-            outward = poses.rotation[world, entity] * (
-                surface.uv[0] * geometry.normals[vertex + surface.corners[0]]
-                + surface.uv[1] * geometry.normals[vertex + surface.corners[1]]
-                + (1.0 - surface.uv[0] - surface.uv[1]) * geometry.normals[vertex + surface.corners[2]]
+            vertex = geometry[0].first_vertex[mesh]
+            outward = poses[0].rotation[world, entity] * (
+                surface.uv[0] * geometry[0].normals[vertex + surface.corners[0]]
+                + surface.uv[1] * geometry[0].normals[vertex + surface.corners[1]]
+                + (1.0 - surface.uv[0] - surface.uv[1]) * geometry[0].normals[vertex + surface.corners[2]]
             )
             if wp.dot(outward, surface.normal) < 0.0:
                 surface.first_transfer = -1  # the back of an open surface: what is stored is of its front
-        view = wp.normalize(lighting.eye[world] - surface.position)
+        view = wp.normalize(lighting[0].eye[world] - surface.position)
         surface.mirrored = 2.0 * wp.dot(surface.normal, view) * surface.normal - view
         return surface
 
@@ -101,35 +104,45 @@ def make_direct(order: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def transfer_of(surface: Surface, rows: wp.array(dtype=half_values), lighting: Lighting, o: Occlusion) -> values:
+    def transfer_of(
+        surface: Surface,
+        rows: wp.array(dtype=half_values),
+        lighting: LightingTables,
+        o: OcclusionTables,
+    ) -> values:
         """The clamped cosine, times what the body leaves of its own hemisphere."""
         if surface.first_transfer >= 0:
-            return kit.at_directions(stored_at(lighting.transfer, surface), rows)
-        return kit.zonal_at_directions(wp.static(cosine_profile), surface.normal, o.quadrature)
+            return kit.at_directions(stored_at(lighting[0].transfer, surface), rows)
+        return kit.zonal_at_directions(wp.static(cosine_profile), surface.normal, o[0].quadrature)
 
     @wp.func
-    def open_to_self(surface: Surface, rows: wp.array(dtype=half_values), lighting: Lighting, o: Occlusion) -> values:
+    def open_to_self(
+        surface: Surface,
+        rows: wp.array(dtype=half_values),
+        lighting: LightingTables,
+        o: OcclusionTables,
+    ) -> values:
         """1 minus what the body itself blocks above the horizon."""
         open_share = values(1.0)
-        if surface.first_transfer >= 0 and lighting.light_entity.shape[0] > 0:
-            open_share += kit.at_directions(stored_at(lighting.self_visibility, surface), rows)
-            open_share -= kit.cap_coverage(surface.normal, 1.0, o.quadrature)
+        if surface.first_transfer >= 0 and lighting[0].light_entity.shape[0] > 0:
+            open_share += kit.at_directions(stored_at(lighting[0].self_visibility, surface), rows)
+            open_share -= kit.cap_coverage(surface.normal, 1.0, o[0].quadrature)
         return open_share
 
     @wp.func
-    def environment_light(world: int, received: values, lighting: Lighting) -> wp.vec3:
+    def environment_light(world: int, received: values, lighting: LightingTables) -> wp.vec3:
         return wp.vec3(
-            kit.sum_of_products(lighting.environment[world, 0], received),
-            kit.sum_of_products(lighting.environment[world, 1], received),
-            kit.sum_of_products(lighting.environment[world, 2], received),
+            kit.sum_of_products(lighting[0].environment[world, 0], received),
+            kit.sum_of_products(lighting[0].environment[world, 1], received),
+            kit.sum_of_products(lighting[0].environment[world, 2], received),
         )
 
     @wp.func
-    def facing_of(world: int, light: int, poses: PoseTable, lighting: Lighting) -> wp.vec3:
+    def facing_of(world: int, light: int, poses: PoseTables, lighting: LightingTables) -> wp.vec3:
         """The side to which a flat light shines, in the world; zero for others, and for a light that is not there."""
-        if light >= lighting.light_entity.shape[0]:
+        if light >= lighting[0].light_entity.shape[0]:
             return wp.vec3()
-        return poses.rotation[world, lighting.light_entity[light]] * lighting.light_facing[light]
+        return poses[0].rotation[world, lighting[0].light_entity[light]] * lighting[0].light_facing[light]
 
     @wp.func
     def area_light(
@@ -138,22 +151,22 @@ def make_direct(order: int) -> SimpleNamespace:
         surface: Surface,
         before: values,
         lobe: values,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        lighting: Lighting,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
     ):
         """Irradiance and radiance through the Phong lobe of one area light, past `before`: what stands before it.
 
         What the light sends unhindered, times the share of it that is visible.
         """
-        entity = lighting.light_entity[light]
+        entity = lighting[0].light_entity[light]
         p = surface.position
         n = surface.normal
-        rotation = poses.rotation[world, entity]
-        position = poses.position[world, entity]
-        radius = geometry.radius[entity]
-        center = position + rotation * geometry.center[entity]
+        rotation = poses[0].rotation[world, entity]
+        position = poses[0].position[world, entity]
+        radius = geometry[0].radius[entity]
+        center = position + rotation * geometry[0].center[entity]
         facing = facing_of(world, light, poses, lighting)
         diffuse = float(0.0)
         glossy = float(0.0)
@@ -161,18 +174,18 @@ def make_direct(order: int) -> SimpleNamespace:
         if wp.length_sq(facing) > 0.0:
             hidden = hidden or wp.dot(facing, p - center) <= 0.0
         if not hidden:
-            seen = kit.covered_by(world, entity, p, geometry, poses, o)
-            weighted = wp.cw_mul(seen, lighting.weights[0])
+            seen = kit.covered_around(world, entity, p, geometry, poses, o)
+            weighted = wp.cw_mul(seen, lighting[0].weights[0])
             whole = wp.max(kit.sum_of_products(weighted, values(1.0)), 1.0e-9)
             share = wp.clamp(kit.sum_of_products(weighted, before) / whole, 0.0, 1.0)
-            diffuse = area.area_irradiance(entity, p, n, position, rotation, center, radius, o.occluders)
+            diffuse = area.area_irradiance(entity, p, n, position, rotation, center, radius, o[0].occluders)
             if diffuse < 0.0:
-                cosine = kit.zonal_at_directions(wp.static(cosine_profile), n, o.quadrature)
+                cosine = kit.zonal_at_directions(wp.static(cosine_profile), n, o[0].quadrature)
                 diffuse = wp.max(kit.sum_of_products(weighted, cosine), 0.0)
             diffuse *= share
-            if wp.max(geometry.specular[surface.entity]) > 0.0:
-                exponent = geometry.exponent[surface.entity]
-                glossy = area.area_gloss(entity, p, n, surface.mirrored, exponent, position, rotation, o.occluders)
+            if wp.max(geometry[0].specular[surface.entity]) > 0.0:
+                exponent = geometry[0].exponent[surface.entity]
+                glossy = area.area_gloss(entity, p, n, surface.mirrored, exponent, position, rotation, o[0].occluders)
                 if glossy < 0.0:
                     glossy = wp.max(kit.sum_of_products(weighted, lobe), 0.0)
                 glossy *= share
@@ -184,10 +197,10 @@ def make_direct(order: int) -> SimpleNamespace:
         receivers: ReceiverTable,
         turns: wp.array2d(dtype=wp.int32),  # (world, receiver)
         turn: int,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        lighting: Lighting,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
         diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, receiver): irradiance
         glossy_out: wp.array2d(dtype=wp.vec3),  # (world, receiver): radiance through the normalised Phong lobe
     ):
@@ -199,34 +212,34 @@ def make_direct(order: int) -> SimpleNamespace:
         surface = surface_of(world, receiver, receivers, geometry, poses, lighting)
         p = surface.position
         n = surface.normal
-        rows = o.rows[world, entity]
+        rows = o[0].rows[world, entity]
         transfer = transfer_of(surface, rows, lighting, o)
 
-        lights = lighting.light_entity.shape[0]
+        lights = lighting[0].light_entity.shape[0]
         shining = int(-1)
         if lights > 0:
-            shining = lighting.light_entity[0]
+            shining = lighting[0].light_entity[0]
         facing = facing_of(world, 0, poses, lighting)
         visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
         diffuse = environment_light(world, wp.cw_mul(visible, transfer), lighting)
         glossy = wp.vec3()
         lobe = values()
-        if wp.max(geometry.specular[entity]) > 0.0:
+        if wp.max(geometry[0].specular[entity]) > 0.0:
             # The transfer brings the cosine that the lobe is normalised for, and what the body hides from itself.
-            lobe = kit.zonal_at_directions(lighting.lobe[entity], surface.mirrored, o.quadrature)
+            lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
             lobe = wp.cw_mul(lobe, transfer)
             glossy = environment_light(world, wp.cw_mul(visible, lobe), lighting)
 
         open_share = open_to_self(surface, rows, lighting, o)
         for light in range(lights):
             if light > 0:
-                shining = lighting.light_entity[light]
+                shining = lighting[0].light_entity[light]
                 facing = facing_of(world, light, poses, lighting)
                 _visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
             passed = wp.cw_mul(before, open_share)
             irradiance, gloss = area_light(world, light, surface, passed, lobe, geometry, poses, o, lighting)
-            diffuse += irradiance * lighting.light_radiance[world, light]
-            glossy += gloss * lighting.light_radiance[world, light]
+            diffuse += irradiance * lighting[0].light_radiance[world, light]
+            glossy += gloss * lighting[0].light_radiance[world, light]
 
         # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
         zero = wp.vec3()
@@ -236,6 +249,7 @@ def make_direct(order: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(kit),
         Lighting=Lighting,
+        LightingTables=LightingTables,
         Surface=Surface,
         surface_of=surface_of,
         stored_at=stored_at,
@@ -259,6 +273,7 @@ class DirectState:
 
     order: int
     table: Any  # make_direct(order).Lighting
+    tables: wp.array  # (1): the table, as kernels take it
 
 
 def upload_lighting(
@@ -298,7 +313,7 @@ def upload_lighting(
     table.first_transfer = wp.array(first, dtype=wp.int32, device=device)
     lobes = [legendre_series(sh.phong_lobe(entity.lobe.exponent, order + 1)) for entity in scene.entities]
     table.lobe = wp.array(np.array(lobes, np.float32).reshape(-1, order + 1), dtype=kit.profile, device=device)
-    return DirectState(order, table)
+    return DirectState(order, table, upload_tables([table], kit.Lighting, device))
 
 
 def write_environment(state: DirectState, coefficients: np.ndarray) -> None:
@@ -326,7 +341,7 @@ def shade_direct(
     turns: int32 (worlds, receivers). diffuse, glossy: vec3 (worlds, receivers); the others' values stay.
     """
     kit = make_direct(lighting.order)
-    inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.table, lighting.table]
+    inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.tables, lighting.tables]
     launch(kit.shade_receivers, diffuse.shape, inputs, [diffuse, glossy], device)
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_psf.shade.coverage import make_coverage
-from warp_psf.shade.patches import PatchTable
+from warp_psf.shade.patches import PatchTables
 
 # A point closer to a face than this share of the slab's half-diagonal sees it from this height: bodies that touch it
 # sink in a little, and from the plane itself a face is not seen.
@@ -38,11 +38,11 @@ def make_faces(order: int) -> SimpleNamespace:
     ) -> rgb_values: ...
 
     @wp.func
-    def sees_face(world: int, face: int, p_slab: wp.vec3, patches: PatchTable) -> bool:
+    def sees_face(world: int, face: int, p_slab: wp.vec3, patches: PatchTables) -> bool:
         """Whether a point of the slab's frame lies before a face, or touches it, and the face sends out light."""
-        half = patches.half[face]
-        height = patches.side[face] * p_slab[patches.axis[face]] - half[2]
-        return patches.seen[world, face] == 1 and height > -wp.static(LOWEST_HEIGHT) * wp.length(half)
+        half = patches[0].half[face]
+        height = patches[0].side[face] * p_slab[patches[0].axis[face]] - half[2]
+        return patches[0].seen[world, face] == 1 and height > -wp.static(LOWEST_HEIGHT) * wp.length(half)
 
     @wp.func
     def face_coverage(
@@ -50,15 +50,15 @@ def make_faces(order: int) -> SimpleNamespace:
         face: int,
         p_slab: wp.vec3,
         to_slab: wp.mat33,
-        patches: PatchTable,
+        patches: PatchTables,
         quadrature: wp.array(dtype=half_values),
     ) -> values:
         """The directions that a face covers around a point of the slab's frame; to_slab: slab_from_world."""
-        axis = patches.axis[face]
-        side = patches.side[face]
-        half = patches.half[face]
+        axis = patches[0].axis[face]
+        side = patches[0].side[face]
+        half = patches[0].half[face]
         height = side * p_slab[axis] - half[2]
-        part = patches.part[world, face]
+        part = patches[0].part[world, face]
         u = (axis + 1) % 3
         v = (axis + 2) % 3
         p = wp.vec3()
@@ -77,24 +77,24 @@ def make_faces(order: int) -> SimpleNamespace:
         p_slab: wp.vec3,
         n: wp.vec3,
         to_slab: wp.mat33,
-        patches: PatchTable,
+        patches: PatchTables,
         quadrature: wp.array(dtype=half_values),
     ) -> rgb_values:
         """The radiance of a face in every direction from a point of the slab's frame, with normal n in the world.
 
         to_slab: slab_from_world.
         """
-        axis = patches.axis[face]
-        side = patches.side[face]
-        half = patches.half[face]
+        axis = patches[0].axis[face]
+        side = patches[0].side[face]
+        half = patches[0].half[face]
         u = (axis + 1) % 3
         v = (axis + 2) % 3
         to_face = wp.matrix_from_rows(to_slab[u], to_slab[v], side * to_slab[axis])
         lowest = wp.static(LOWEST_HEIGHT) * wp.length(half)
-        part = patches.part[world, face]
+        part = patches[0].part[world, face]
         p = wp.vec3(p_slab[u] - part[0], p_slab[v] - part[2], wp.max(side * p_slab[axis] - half[2], lowest))
-        focus = patches.focus[world, face]
-        size = patches.size[face]
+        focus = patches[0].focus[world, face]
+        size = patches[0].size[face]
         return look_up_directions(
             p,
             n,
@@ -102,9 +102,9 @@ def make_faces(order: int) -> SimpleNamespace:
             wp.vec3(wp.max(part[1], 1.0e-9), wp.max(part[3], 1.0e-9), 0.0),
             size,
             focus,
-            patches.first[face],
-            patches.levels[face],
-            patches.radiance[world],
+            patches[0].first[face],
+            patches[0].levels[face],
+            patches[0].radiance[world],
             quadrature,
         )
 

@@ -16,13 +16,13 @@ from warp_psf.basis.directions import along_axis_snippet, project_products_snipp
 from warp_psf.device import launch
 from warp_psf.field.moments import FIRST, SECOND
 from warp_psf.field.radiance import SummedFields
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.delta import DeltaLightTable, DeltaState, delta_light
 from warp_psf.shade.direct import DirectState
 from warp_psf.shade.faces import make_faces
-from warp_psf.shade.occlude import OcclusionState
-from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
+from warp_psf.shade.occluders import OcclusionState
+from warp_psf.shade.patches import PatchTables, slab_from_world, slab_origin
 from warp_psf.shade.tables import make_tables
 
 
@@ -32,7 +32,7 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
     kit = make_tables(order, functions)
     patch = make_faces(order)
     radiant, moments, values, half_values = kit.radiant, kit.moments, kit.values, kit.half_values
-    Occlusion, Lighting = kit.Occlusion, kit.Lighting
+    OcclusionTables, LightingTables = kit.OcclusionTables, kit.LightingTables
     BodyTable, KeptTable, GlossTable = kit.BodyTable, kit.KeptTable, kit.GlossTable
 
     @wp.func_native(along_axis_snippet(kit.points))
@@ -83,13 +83,13 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         n: wp.vec3,
         irradiance: wp.vec3,
         albedo: wp.vec3,
-        geometry: GeometryTable,
+        geometry: GeometryTables,
         gloss: GlossTable,
     ) -> wp.vec3:
         """Notes the vector of the light that a glossy proxy reflects; returns the radiance as if it left evenly."""
         factors = gloss.factors[gloss.row[entity]]
         moment = gloss.moment[world, place]
-        specular = geometry.specular[entity]
+        specular = geometry[0].specular[entity]
         even = wp.vec3()
         vector = wp.mat33()
         for channel in range(3):
@@ -113,10 +113,10 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
     def shade_moments(
         first: int,
         proxies: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        lighting: Lighting,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
         gloss: GlossTable,
         irradiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
     ):
@@ -127,31 +127,31 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         surface = kit.surface_of(world, proxy, proxies, geometry, poses, lighting)
         p = surface.position
         n = surface.normal
-        rows = o.rows[world, entity]
+        rows = o[0].rows[world, entity]
         transfer = kit.transfer_of(surface, rows, lighting, o)
-        lights = lighting.light_entity.shape[0]
+        lights = lighting[0].light_entity.shape[0]
         shining = int(-1)
         if lights > 0:
-            shining = lighting.light_entity[0]
+            shining = lighting[0].light_entity[0]
         facing = kit.facing_of(world, 0, poses, lighting)
         visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
         received = wp.cw_mul(visible, transfer)
         irradiance = kit.environment_light(world, received, lighting)
         moment = wp.mat33()
         for axis in range(3):
-            along = kit.environment_light(world, along_axis(received, axis, o.quadrature), lighting)
+            along = kit.environment_light(world, along_axis(received, axis, o[0].quadrature), lighting)
             for channel in range(3):
                 moment[channel, axis] = along[channel]
         open_to_self = kit.open_to_self(surface, rows, lighting, o)
         for light in range(lights):
-            source = lighting.light_entity[light]
+            source = lighting[0].light_entity[light]
             if light > 0:
                 facing = kit.facing_of(world, light, poses, lighting)
                 _visible, before = kit.visibility_at(world, entity, source, facing, p, n, geometry, poses, o)
             passed = wp.cw_mul(before, open_to_self)
             strength, _gloss = kit.area_light(world, light, surface, passed, values(), geometry, poses, o, lighting)
-            center = poses.position[world, source] + poses.rotation[world, source] * geometry.center[source]
-            sent = strength * lighting.light_radiance[world, light]
+            center = poses[0].position[world, source] + poses[0].rotation[world, source] * geometry[0].center[source]
+            sent = strength * lighting[0].light_radiance[world, light]
             irradiance += sent
             moment += wp.outer(sent, wp.normalize(center - p))
         irradiance_out[world, proxy] = wp.max(irradiance, wp.vec3())
@@ -161,8 +161,8 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
     def add_delta_moments(
         first: int,
         proxies: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
         opacity: wp.array(dtype=wp.float32),  # (entity)
         lights: DeltaLightTable,
         far: float,
@@ -204,10 +204,10 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
     def gather_moments(
         first: int,
         proxies: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        patches: PatchTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        patches: PatchTables,
         bodies: BodyTable,
         kept: KeptTable,
         gloss: GlossTable,
@@ -239,13 +239,13 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
                     moment[channel, axis] += found[axis]
         for place in range(kept.face_count[world, proxy]):
             seen = kept.face[world, proxy, place]
-            slab = patches.entity[seen]
+            slab = patches[0].entity[seen]
             to_slab = slab_from_world(world, slab, poses, patches)
             p_slab = to_slab * (proxies.position[world, proxy] - slab_origin(world, slab, poses, patches))
-            shown = patch.face_radiance(world, seen, p_slab, n, to_slab, patches, o.quadrature)
+            shown = patch.face_radiance(world, seen, p_slab, n, to_slab, patches, o[0].quadrature)
             transport = kept.transport[world, proxy, place]
             for axis in range(3):
-                found = kit.sum_rgb(along_axis(transport, axis, o.quadrature), shown)
+                found = kit.sum_rgb(along_axis(transport, axis, o[0].quadrature), shown)
                 for channel in range(3):
                     moment[channel, axis] += found[channel]
         light = kit.light_of(world, own, bodies.own[proxy], bodies)
@@ -323,7 +323,7 @@ def shade_gloss(
     """Direct light of the glossy proxies: its moment, and `irradiance`, vec3 (world, proxy), but for delta lights."""
     kit = make_gloss(state.order, state.functions)
     shape = state.table.moment.shape
-    inputs = [proxies, scene.geometry, scene.poses, occlusion.table, lighting.table, state.table]
+    inputs = [proxies, scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.table]
     launch(kit.shade_moments, shape, inputs, [irradiance], device)
     if delta.table.kind.shape[1] > 0:
         opacity = occlusion.table.occluders.opacity

@@ -14,11 +14,11 @@ import warp as wp
 
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.directions import make_directions, project_snippet
-from warp_psf.scene.geometry import GeometryTable, PoseTable
+from warp_psf.scene.geometry import GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import overlap
 from warp_psf.shade.bounce import make_bounce
-from warp_psf.shade.patches import PatchTable, slab_from_world, slab_origin
+from warp_psf.shade.patches import PatchTables, slab_from_world, slab_origin
 from warp_psf.shade.relations import RelationTable, hides_body, hides_face
 
 
@@ -33,7 +33,7 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
     kit = make_bounce(order, functions)
     between, patch, radiant = kit.between, kit.patch, kit.radiant
     vec, values, half_values = kit.vec, kit.values, kit.half_values
-    Occlusion, Lighting, Surface = kit.Occlusion, kit.Lighting, kit.Surface
+    OcclusionTables, LightingTables, Surface = kit.OcclusionTables, kit.LightingTables, kit.Surface
     bands = wide_order(order)
     wide = sh.make_sh(bands).vec
     evaluate_wide = sh.make_sh(bands).evaluate
@@ -63,13 +63,13 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         world: int,
         entity: int,
         weighted: values,
-        o: Occlusion,
-        lighting: Lighting,
+        o: OcclusionTables,
+        lighting: LightingTables,
         wide_rows: wp.array(dtype=half_values),
     ) -> wide:
         """Onto SH: about the axes of a body that shadows itself, as its stored transfer is; else about the world's."""
-        if lighting.first_transfer[entity] >= 0:
-            return widen(kit.project(weighted, o.rows[world, entity]))
+        if lighting[0].first_transfer[entity] >= 0:
+            return widen(kit.project(weighted, o[0].rows[world, entity]))
         return project_wide(weighted, wide_rows)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -78,11 +78,11 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         start: int,
         probe_slot: wp.array(dtype=wp.int32),  # (probe): world * slots + slot
         receivers: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        lighting: Lighting,
-        patches: PatchTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
+        patches: PatchTables,
         relations: RelationTable,
         fields: radiant.RadianceTable,
         bodies: kit.BodyTable,
@@ -115,11 +115,11 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         # All pixels around a probe on a flat face have its normal; on round bodies they do not.
         gain = between.numbers()
         for place in range(sources.count):
-            covered = kit.covered_by(world, entity_at[place], p, geometry, poses, o)
+            covered = kit.covered_around(world, entity_at[place], p, geometry, poses, o)
             covers[place] = weight[place] * covered
             gain[place] = 1.0
-            if patches.first_face[own] >= 0:
-                gain[place] = between.horizon_gain(covered, n, lighting.weights[0], o.quadrature)
+            if patches[0].first_face[own] >= 0:
+                gain[place] = between.horizon_gain(covered, n, lighting[0].weights[0], o[0].quadrature)
         incident = kit.rgb_values()
         for place in range(sources.count):
             source = entity_at[place]
@@ -135,45 +135,45 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
                             )
                         if share > 0.0:
                             passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                p_body = wp.transpose(poses.rotation[world, source]) * (p - poses.position[world, source])
+                p_body = wp.transpose(poses[0].rotation[world, source]) * (p - poses[0].position[world, source])
                 where = radiant.locate(fields, bodies.field[source], p_body)
                 rgb = radiant.lookup_summed(summed[world], summed_first[source], where)
-                rows = o.rows[world, source]
+                rows = o[0].rows[world, source]
                 incident = add_vectors(incident, rgb, rows, passed)
                 row = gloss.row[source]
                 if row >= 0:
                     for axis in range(3):
                         rgb = radiant.lookup_summed(along[world], along_first[3 * row + axis], where)
                         # Light leaves against the direction in which it is seen.
-                        passed_along = kit.along_axis(passed, axis, o.quadrature)
+                        passed_along = kit.along_axis(passed, axis, o[0].quadrature)
                         incident = add_vectors(incident, rgb, rows, -passed_along)
-            elif patches.first_face[source] >= 0:
+            elif patches[0].first_face[source] >= 0:
                 to_slab = slab_from_world(world, source, poses, patches)
                 p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
                 for side in range(6):
-                    face = patches.first_face[source] + side
+                    face = patches[0].first_face[source] + side
                     if patch.sees_face(world, face, p_slab, patches):
-                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o.quadrature)
+                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o[0].quadrature)
                         passed = weight[place] * passed
                         for other in range(sources.count):
                             if other != place:
                                 share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
                                 if share > 0.0:
                                     passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                        radiance = patch.face_radiance(world, face, p_slab, n, to_slab, patches, o.quadrature)
+                        radiance = patch.face_radiance(world, face, p_slab, n, to_slab, patches, o[0].quadrature)
                         incident = add_products(incident, radiance, passed)
         for channel in range(3):
-            weighted = weigh_channel(incident, channel, lighting.weights[0])
+            weighted = weigh_channel(incident, channel, lighting[0].weights[0])
             light_out[probe, channel] = to_sh(world, own, weighted, o, lighting, wide_rows)
 
     @wp.func
-    def response_of(world: int, surface: Surface, poses: PoseTable, lighting: Lighting) -> wide:
+    def response_of(world: int, surface: Surface, poses: PoseTables, lighting: LightingTables) -> wide:
         """What incident light is to be multiplied with to give irradiance."""
         if surface.first_transfer >= 0:
-            return widen(kit.stored_at(lighting.transfer, surface))
+            return widen(kit.stored_at(lighting[0].transfer, surface))
         n = surface.normal
-        if lighting.first_transfer[surface.entity] >= 0:
-            n = wp.transpose(poses.rotation[world, surface.entity]) * n
+        if lighting[0].first_transfer[surface.entity] >= 0:
+            n = wp.transpose(poses[0].rotation[world, surface.entity]) * n
         return wp.cw_mul(wp.static(cosine), evaluate_wide(n))
 
     return SimpleNamespace(

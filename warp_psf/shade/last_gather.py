@@ -14,13 +14,13 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.field.radiance import sum_fields
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.bounce import BounceState
 from warp_psf.shade.direct import DirectState
 from warp_psf.shade.incident import wide_rows
 from warp_psf.shade.lattice import INTERPOLATED, Lattice, interpolate_lattice
-from warp_psf.shade.occlude import OcclusionState
+from warp_psf.shade.occluders import OcclusionState
 from warp_psf.shade.probes import LEAST_WEIGHT, SPACINGS, ProbeTable, make_probes
 
 # A lobe that reflects no more than this mirrors the bodies around too faintly to be seen; it takes their mean.
@@ -34,7 +34,7 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
     """The kernel with which pixels receive the light of probes; see `make_probes`."""
     kit = make_probes(order, functions)
     wide, half_values = kit.wide, kit.half_values
-    Occlusion, Lighting = kit.Occlusion, kit.Lighting
+    OcclusionTables, LightingTables = kit.OcclusionTables, kit.LightingTables
     cell_of, irradiance_of = kit.cell_of, kit.irradiance_of
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -43,10 +43,10 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
         probes: ProbeTable,
         receivers: ReceiverTable,
         pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
-        geometry: GeometryTable,
-        poses: PoseTable,
-        o: Occlusion,
-        lighting: Lighting,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
         wide_rows: wp.array(dtype=half_values),
         light: wp.array2d(dtype=wide),  # (probe, channel)
         own_first: wp.array(dtype=wp.int32),  # (entity): first of `own_light`, -1 for convex bodies
@@ -65,12 +65,12 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             return
         surface = kit.surface_of(world, slot, receivers, geometry, poses, lighting)
         response = kit.response_of(world, surface, poses, lighting)
-        is_glossy = wp.max(geometry.specular[entity]) > wp.static(LEAST_SHINE)
+        is_glossy = wp.max(geometry[0].specular[entity]) > wp.static(LEAST_SHINE)
         shine = wide()
         if is_glossy:
-            transfer = kit.transfer_of(surface, o.rows[world, entity], lighting, o)
-            lobe = kit.zonal_at_directions(lighting.lobe[entity], surface.mirrored, o.quadrature)
-            weighted = wp.cw_mul(wp.cw_mul(lobe, transfer), lighting.weights[0])
+            transfer = kit.transfer_of(surface, o[0].rows[world, entity], lighting, o)
+            lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
+            weighted = wp.cw_mul(wp.cw_mul(lobe, transfer), lighting[0].weights[0])
             shine = kit.to_sh(world, entity, weighted, o, lighting, wide_rows)
         diffuse = wp.vec3()
         glossy = wp.vec3()
@@ -221,7 +221,7 @@ def gather_last_bounce(
         array.fill_(value)
     gather.count = 0
     launch(_find_pixels, extra.shape, [extra, extra_count], [gather.pixel_of], device)
-    seen = [pixels, scene.geometry, scene.poses, lighting.table]
+    seen = [pixels, scene.geometry, scene.poses, lighting.tables]
     cells = [-(-table.width // spacing) * -(-table.height // spacing) for spacing in SPACINGS]
     launch(_choose_lattice, (worlds, cells[0]), [SPACINGS[0], table, pixels], [gather.chosen], device)
     _gather_chosen(gather, extra.shape[1], pixels, scene, occlusion, lighting, device)
@@ -238,7 +238,7 @@ def gather_last_bounce(
     )
     _gather_chosen(gather, gather.chosen.shape[1], pixels, scene, occlusion, lighting, device)
 
-    inputs = [table, pixels, gather.pixel_of, scene.geometry, scene.poses, occlusion.table, lighting.table]
+    inputs = [table, pixels, gather.pixel_of, scene.geometry, scene.poses, occlusion.tables, lighting.tables]
     inputs += [gather.wide_rows, gather.light, state.own_first, state.own_light, lattice.turns]
     launch(kit.receive_incident, gather.chosen.shape, inputs, list(bounced), device)
     interpolate_lattice(lattice, pixels, *bounced, device)
@@ -267,9 +267,9 @@ def _gather_chosen(
         larger = wp.zeros((2 * (gather.count + fresh), 3), dtype=kit.wide, device=device)
         wp.copy(larger, gather.light, count=gather.light.size)
         gather.light = larger
-    inputs = [gather.count, gather.table.slot, pixels, scene.geometry, scene.poses, occlusion.table, lighting.table]
+    inputs = [gather.count, gather.table.slot, pixels, scene.geometry, scene.poses, occlusion.tables, lighting.tables]
     inputs += [
-        state.patches.table,
+        state.patches.tables,
         state.relations,
         state.fields,
         state.bodies,

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.device import launch, upload_tables
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
-from warp_psf.shade.occlude import OcclusionState
+from warp_psf.shade.occluders import OcclusionState
 
 # Texels along the longest side of a slab, and of all slabs together; the smallest slabs give some up first.
 MOST_TEXELS_PER_SIDE = 64
@@ -66,6 +66,9 @@ class PatchTable:
     openness: wp.array2d(dtype=wp.float32)
 
 
+PatchTables = wp.array(dtype=PatchTable)
+
+
 @dataclass(frozen=True)
 class Patches:
     """The faces of a scene's slabs.
@@ -74,6 +77,7 @@ class Patches:
     """
 
     table: PatchTable
+    tables: wp.array  # (1): the table, as kernels take it
     texels: int
     stations: np.ndarray
 
@@ -85,25 +89,25 @@ def axis_vector(axis: int) -> wp.vec3:
 
 
 @wp.func
-def slab_from_world(world: int, entity: int, poses: PoseTable, patches: PatchTable) -> wp.mat33:
-    return wp.transpose(poses.rotation[world, entity] * patches.rotation[entity])
+def slab_from_world(world: int, entity: int, poses: PoseTables, patches: PatchTables) -> wp.mat33:
+    return wp.transpose(poses[0].rotation[world, entity] * patches[0].rotation[entity])
 
 
 @wp.func
-def slab_origin(world: int, entity: int, poses: PoseTable, patches: PatchTable) -> wp.vec3:
+def slab_origin(world: int, entity: int, poses: PoseTables, patches: PatchTables) -> wp.vec3:
     """The middle of a slab, in the world."""
-    return poses.position[world, entity] + poses.rotation[world, entity] * patches.center[entity]
+    return poses[0].position[world, entity] + poses[0].rotation[world, entity] * patches[0].center[entity]
 
 
 @wp.func
 def reach_along(
-    n: wp.vec3, world: int, entity: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable
+    n: wp.vec3, world: int, entity: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables
 ) -> float:
     """How far a body reaches from its centre along a direction of the world: a slab's box, any other's sphere."""
-    if patches.first_face[entity] < 0:
-        return geometry.radius[entity]
+    if patches[0].first_face[entity] < 0:
+        return geometry[0].radius[entity]
     n_slab = slab_from_world(world, entity, poses, patches) * n
-    return wp.dot(wp.vec3(wp.abs(n_slab[0]), wp.abs(n_slab[1]), wp.abs(n_slab[2])), patches.slab_half[entity])
+    return wp.dot(wp.vec3(wp.abs(n_slab[0]), wp.abs(n_slab[1]), wp.abs(n_slab[2])), patches[0].slab_half[entity])
 
 
 @wp.func
@@ -122,21 +126,21 @@ def texel_center(index: int, count: int, half: float, focus: float, scale: float
 
 
 @wp.func
-def uncovered_part(world: int, face: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable) -> wp.vec4:
+def uncovered_part(world: int, face: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables) -> wp.vec4:
     """Middle and half extent along both axes of a face without the ends that other slabs enclose: walls meet so."""
-    own = patches.entity[face]
-    axis = patches.axis[face]
-    half = patches.half[face]
+    own = patches[0].entity[face]
+    axis = patches[0].axis[face]
+    half = patches[0].half[face]
     to_slab = slab_from_world(world, own, poses, patches)
     origin = slab_origin(world, own, poses, patches)
-    skin = wp.static(ENCLOSED) * geometry.radius[own]
+    skin = wp.static(ENCLOSED) * geometry[0].radius[own]
     lower = -half
     upper = wp.vec3(half[0], half[1], half[2])
-    height = patches.side[face] * half[2]
-    for entity in range(patches.opacity.shape[0]):
-        if patches.opacity[entity] == 1.0 and entity != own and patches.first_face[entity] >= 0:
+    height = patches[0].side[face] * half[2]
+    for entity in range(patches[0].opacity.shape[0]):
+        if patches[0].opacity[entity] == 1.0 and entity != own and patches[0].first_face[entity] >= 0:
             turned = to_slab * wp.transpose(slab_from_world(world, entity, poses, patches))
-            size = patches.slab_half[entity]
+            size = patches[0].slab_half[entity]
             middle = to_slab * (slab_origin(world, entity, poses, patches) - origin)
             # Of a slab that stands askew only a box inside it counts, which for a thin one is nothing.
             reach = wp.vec3()
@@ -147,7 +151,7 @@ def uncovered_part(world: int, face: int, geometry: GeometryTable, poses: PoseTa
                         largest = column
                 across = wp.abs(turned[row, 0]) + wp.abs(turned[row, 1]) + wp.abs(turned[row, 2])
                 askew = across - wp.abs(turned[row, largest])
-                reach[row] = size[largest] - askew * geometry.radius[entity]
+                reach[row] = size[largest] - askew * geometry[0].radius[entity]
             if wp.abs(height - middle[axis]) <= reach[axis] + skin:
                 for which in range(2):
                     along = (axis + 1 + which) % 3
@@ -172,11 +176,11 @@ def uncovered_part(world: int, face: int, geometry: GeometryTable, poses: PoseTa
 
 
 @wp.func
-def block_of(texel: int, patches: PatchTable) -> wp.vec4i:
+def block_of(texel: int, patches: PatchTables) -> wp.vec4i:
     """The block in which a texel lies: its first texel, the texels from one row to the next, and its own two sides."""
-    face = patches.texel_face[texel]
-    size = patches.size[face]
-    start = patches.first_texel[face]
+    face = patches[0].texel_face[texel]
+    size = patches[0].size[face]
+    start = patches[0].first_texel[face]
     across = wp.min(wp.static(BLOCK), size[0])
     down = wp.min(wp.static(BLOCK), size[1])
     left = (texel - start) % size[0] / across * across
@@ -185,37 +189,37 @@ def block_of(texel: int, patches: PatchTable) -> wp.vec4i:
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable):
+def _focus_faces(first: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables):
     world, face = wp.tid()
     face += first
-    own = patches.entity[face]
-    axis = patches.axis[face]
-    half = patches.half[face]
+    own = patches[0].entity[face]
+    axis = patches[0].axis[face]
+    half = patches[0].half[face]
     to_slab = slab_from_world(world, own, poses, patches)
     to_world = wp.transpose(to_slab)
     origin = slab_origin(world, own, poses, patches)
-    n = patches.side[face] * axis_vector(axis)
+    n = patches[0].side[face] * axis_vector(axis)
     n_world = to_world * n
     part = uncovered_part(world, face, geometry, poses, patches)
-    patches.part[world, face] = part
+    patches[0].part[world, face] = part
     count = float(0.0)
     mean = wp.vec2()
     squares = wp.vec2()
     seen = int(0)
-    for entity in range(patches.opacity.shape[0]):
-        if patches.opacity[entity] > 0.0 and entity != own:
-            position = poses.position[world, entity] + poses.rotation[world, entity] * geometry.center[entity]
+    for entity in range(patches[0].opacity.shape[0]):
+        if patches[0].opacity[entity] > 0.0 and entity != own:
+            position = poses[0].position[world, entity] + poses[0].rotation[world, entity] * geometry[0].center[entity]
             p = to_slab * (position - origin)
             rise = reach_along(n_world, world, entity, geometry, poses, patches)
-            if wp.dot(n, p) + rise > half[2] + wp.static(FACE_HORIZON) * geometry.radius[own]:
+            if wp.dot(n, p) + rise > half[2] + wp.static(FACE_HORIZON) * geometry[0].radius[own]:
                 seen = 1
-            if patches.first_face[entity] < 0:
+            if patches[0].first_face[entity] < 0:
                 # Bodies with a shape of their own draw the texels to where they are, those far away hardly.
                 u = p[(axis + 1) % 3] - part[0]
                 v = p[(axis + 2) % 3] - part[2]
                 x = wp.clamp(u, -part[1], part[1])
                 y = wp.clamp(v, -part[3], part[3])
-                squared = geometry.radius[entity] * geometry.radius[entity]
+                squared = geometry[0].radius[entity] * geometry[0].radius[entity]
                 away = wp.length_sq(wp.vec3(u - x, v - y, wp.max(wp.dot(n, p) - half[2], 0.0)))
                 pull = squared / (squared + away)
                 spread = wp.static(SPREAD_PER_RADIUS * SPREAD_PER_RADIUS) * squared
@@ -223,7 +227,7 @@ def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches:
                 mean += pull * wp.vec2(x, y)
                 squares += pull * wp.vec2(x * x + spread, y * y + spread)
     # The sides of a rectangle have no area, nor has what is enclosed.
-    patches.seen[world, face] = wp.where(part[1] * part[3] > 0.0, seen, 0)
+    patches[0].seen[world, face] = wp.where(part[1] * part[3] > 0.0, seen, 0)
     focus = wp.vec4(0.0, wp.static(EVEN_SPREAD) * part[1], 0.0, wp.static(EVEN_SPREAD) * part[3])
     if count > 0.0:
         mean = mean / count
@@ -233,29 +237,29 @@ def _focus_faces(first: int, geometry: GeometryTable, poses: PoseTable, patches:
             mean[1],
             wp.sqrt(wp.max(squares[1] / count - mean[1] * mean[1], 1.0e-12)),
         )
-    patches.focus[world, face] = focus
+    patches[0].focus[world, face] = focus
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _place_texels(first: int, poses: PoseTable, patches: PatchTable, first_proxy: int, proxies: ReceiverTable):
+def _place_texels(first: int, poses: PoseTables, patches: PatchTables, first_proxy: int, proxies: ReceiverTable):
     world, texel = wp.tid()
     texel += first
-    face = patches.texel_face[texel]
-    entity = patches.entity[face]
-    axis = patches.axis[face]
-    half = patches.half[face]
-    size = patches.size[face]
-    part = patches.part[world, face]
-    focus = patches.focus[world, face]
-    index = texel - patches.first_texel[face]
+    face = patches[0].texel_face[texel]
+    entity = patches[0].entity[face]
+    axis = patches[0].axis[face]
+    half = patches[0].half[face]
+    size = patches[0].size[face]
+    part = patches[0].part[world, face]
+    focus = patches[0].focus[world, face]
+    index = texel - patches[0].first_texel[face]
     x = part[0] + texel_center(index % size[0], size[0], part[1], focus[0], focus[1])
     y = part[2] + texel_center(index / size[0], size[1], part[3], focus[2], focus[3])
-    n = patches.side[face] * axis_vector(axis)
+    n = patches[0].side[face] * axis_vector(axis)
     p = x * axis_vector((axis + 1) % 3) + y * axis_vector((axis + 2) % 3) + half[2] * n
     to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
     proxy = first_proxy + texel
     # Nothing sees the light of a face above which nothing rises.
-    proxies.entity[world, proxy] = wp.where(patches.seen[world, face] == 1, entity, -1)
+    proxies.entity[world, proxy] = wp.where(patches[0].seen[world, face] == 1, entity, -1)
     proxies.position[world, proxy] = slab_origin(world, entity, poses, patches) + to_world * p
     proxies.normal[world, proxy] = to_world * n
 
@@ -273,23 +277,23 @@ def _build_pyramids(
     first: int,
     radiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
     first_proxy: int,
-    patches: PatchTable,
+    patches: PatchTables,
 ):
     # What a body stands on is dark and hidden by that same body. Band-limited functions do not tell that sharply: they
     # would see some of the dark below the body in place of the light beside it. So hidden texels take the light of
     # their surroundings: up the pyramid as means of what is seen, down again into the places that are not.
     world, face = wp.tid()
     face += first
-    if patches.seen[world, face] == 0:
+    if patches[0].seen[world, face] == 0:
         return
-    size = patches.size[face]
-    start = patches.first[face]
+    size = patches[0].size[face]
+    start = patches[0].first[face]
     for index in range(size[0] * size[1]):
-        texel = patches.first_texel[face] + index
+        texel = patches[0].first_texel[face] + index
         color = radiance[world, first_proxy + texel]
-        seen = wp.clamp(patches.openness[world, texel] / wp.static(SEEN_OPENNESS), wp.static(LEAST_SEEN), 1.0)
-        patches.radiance[world, start + index] = wp.vec4(color[0], color[1], color[2], seen)
-    levels = patches.levels[face]
+        seen = wp.clamp(patches[0].openness[world, texel] / wp.static(SEEN_OPENNESS), wp.static(LEAST_SEEN), 1.0)
+        patches[0].radiance[world, start + index] = wp.vec4(color[0], color[1], color[2], seen)
+    levels = patches[0].levels[face]
     for level in range(1, levels):
         below = wp.vec2i(wp.max(size[0] >> (level - 1), 1), wp.max(size[1] >> (level - 1), 1))
         width = wp.max(size[0] >> level, 1)
@@ -301,11 +305,11 @@ def _build_pyramids(
         for index in range(width * height):
             a = start + (index / width) * (1 + step_y) * below[0] + (index % width) * (1 + step_x)
             b = a + step_y * below[0]
-            patches.radiance[world, above + index] = average_seen(
-                patches.radiance[world, a],
-                patches.radiance[world, a + step_x],
-                patches.radiance[world, b],
-                patches.radiance[world, b + step_x],
+            patches[0].radiance[world, above + index] = average_seen(
+                patches[0].radiance[world, a],
+                patches[0].radiance[world, a + step_x],
+                patches[0].radiance[world, b],
+                patches[0].radiance[world, b + step_x],
             )
         start = above
     for turn in range(1, levels):
@@ -317,12 +321,12 @@ def _build_pyramids(
         above_height = wp.max(size[1] >> (level + 1), 1)
         start = above - width * height
         for index in range(width * height):
-            own = patches.radiance[world, start + index]
+            own = patches[0].radiance[world, start + index]
             x = (index % width) * above_width / width
             y = (index / width) * above_height / height
-            around = patches.radiance[world, above + y * above_width + x]
+            around = patches[0].radiance[world, above + y * above_width + x]
             mixed = own[3] * own + (1.0 - own[3]) * around
-            patches.radiance[world, start + index] = wp.vec4(mixed[0], mixed[1], mixed[2], own[3])
+            patches[0].radiance[world, start + index] = wp.vec4(mixed[0], mixed[1], mixed[2], own[3])
 
 
 def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState, worlds: int, device: wp.Device):
@@ -369,22 +373,27 @@ def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState
     table.openness = wp.full((worlds, int(texels.sum())), 1.0, dtype=wp.float32, device=device)
     table.radiance = wp.zeros((worlds, sum(places)), dtype=wp.vec4, device=device)
     stations = [start + _block_centers(size) for start, size in zip(np.cumsum(texels) - texels, sizes, strict=True)]
-    return Patches(table, int(texels.sum()), np.concatenate([np.zeros(0, np.int64), *stations]))
+    return Patches(
+        table,
+        upload_tables([table], PatchTable, device),
+        int(texels.sum()),
+        np.concatenate([np.zeros(0, np.int64), *stations]),
+    )
 
 
 def place_texels(
     patches: Patches, scene: DeviceScene, proxies: ReceiverTable, first_proxy: int, device: wp.Device
 ) -> None:
     """Puts the texels where the bodies need them and makes proxies of them, from `first_proxy` on."""
-    table, worlds = patches.table, patches.table.focus.shape[0]
-    launch(_focus_faces, table.focus.shape, [scene.geometry, scene.poses, table], [], device)
-    inputs = [scene.poses, table, first_proxy, proxies]
-    launch(_place_texels, (worlds, patches.texels), inputs, [], device)
+    shape = patches.table.focus.shape
+    launch(_focus_faces, shape, [scene.geometry, scene.poses, patches.tables], [], device)
+    inputs = [scene.poses, patches.tables, first_proxy, proxies]
+    launch(_place_texels, (shape[0], patches.texels), inputs, [], device)
 
 
 def build_pyramids(patches: Patches, radiance: wp.array, first_proxy: int, device: wp.Device) -> None:
     """Takes over the radiance of the proxies, vec3 (world, proxy), and filters it."""
-    launch(_build_pyramids, patches.table.focus.shape, [radiance, first_proxy, patches.table], [], device)
+    launch(_build_pyramids, patches.table.focus.shape, [radiance, first_proxy, patches.tables], [], device)
 
 
 def _block_centers(size: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warp_psf.scene.geometry import GeometryTable, PoseTable
+from warp_psf.scene.geometry import GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.incident import make_incident
 from warp_psf.shade.lattice import INTERPOLATED
@@ -46,7 +46,7 @@ class ProbeTable:
 def make_probes(order: int, functions: int) -> SimpleNamespace:
     """The kernels that choose probes, and the functions that find those near a pixel; see `make_incident`."""
     kit = make_incident(order, functions)
-    wide, Lighting, response_of = kit.wide, kit.Lighting, kit.response_of
+    wide, LightingTables, response_of = kit.wide, kit.LightingTables, kit.response_of
 
     @wp.func
     def affinity(receivers: ReceiverTable, world: int, slot: int, other: int) -> float:
@@ -146,9 +146,9 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
         turn: int,
         probes: ProbeTable,
         receivers: ReceiverTable,
-        geometry: GeometryTable,
-        poses: PoseTable,
-        lighting: Lighting,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        lighting: LightingTables,
         light: wp.array2d(dtype=wide),  # (probe, channel)
         direct: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance
         chosen_out: wp.array2d(dtype=wp.int32),  # (world, slot), set to 1

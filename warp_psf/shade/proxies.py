@@ -14,7 +14,7 @@ from warp_psf.scene.topology import area_vectors
 from warp_psf.shade.between import MOST_SOURCES
 from warp_psf.shade.bounce import BounceState, make_bounce
 from warp_psf.shade.gloss import GlossState
-from warp_psf.shade.occlude import OcclusionState
+from warp_psf.shade.occluders import OcclusionState
 from warp_psf.shade.patches import Patches, upload_patches
 from warp_psf.shade.relations import make_relations
 from warp_psf.shade.separable import factor_lobe

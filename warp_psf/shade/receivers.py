@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable, make_receivers
 from warp_psf.scene.scene import Scene
 
@@ -32,13 +32,13 @@ class VertexReceivers:
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _mark_needed(first: int, pixels: ReceiverTable, geometry: GeometryTable, vertices: VertexTable):
+def _mark_needed(first: int, pixels: ReceiverTable, geometry: GeometryTables, vertices: VertexTable):
     world, slot = wp.tid()
     slot += first
     entity = pixels.entity[world, slot]
     if entity >= 0:
-        mesh = geometry.entity_mesh[entity]
-        corners = geometry.faces[geometry.first_face[mesh] + pixels.face[world, slot]]
+        mesh = geometry[0].entity_mesh[entity]
+        corners = geometry[0].faces[geometry[0].first_face[mesh] + pixels.face[world, slot]]
         start = vertices.first[entity]
         # Several pixels may write the same 1.
         vertices.needed[world, start + corners[0]] = 1
@@ -49,8 +49,8 @@ def _mark_needed(first: int, pixels: ReceiverTable, geometry: GeometryTable, ver
 @wp.kernel(enable_backward=False, module="unique")
 def _place_vertices(
     first: int,
-    geometry: GeometryTable,
-    poses: PoseTable,
+    geometry: GeometryTables,
+    poses: PoseTables,
     vertices: VertexTable,
     receivers: ReceiverTable,
 ):
@@ -60,21 +60,21 @@ def _place_vertices(
         receivers.entity[world, vertex] = -1
         return
     entity = vertices.entity[vertex]
-    start = geometry.first_vertex[geometry.entity_mesh[entity]] + vertex - vertices.first[entity]
-    rotation = poses.rotation[world, entity]
+    start = geometry[0].first_vertex[geometry[0].entity_mesh[entity]] + vertex - vertices.first[entity]
+    rotation = poses[0].rotation[world, entity]
     corner = vertices.corner[vertex]
     receivers.entity[world, vertex] = entity
     receivers.face[world, vertex] = vertices.face[vertex]
     receivers.uv[world, vertex] = wp.vec2(wp.where(corner == 0, 1.0, 0.0), wp.where(corner == 1, 1.0, 0.0))
-    receivers.position[world, vertex] = poses.position[world, entity] + rotation * geometry.vertices[start]
-    receivers.normal[world, vertex] = rotation * geometry.normals[start]
+    receivers.position[world, vertex] = poses[0].position[world, entity] + rotation * geometry[0].vertices[start]
+    receivers.normal[world, vertex] = rotation * geometry[0].normals[start]
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def _interpolate_vertices(
     first: int,
     pixels: ReceiverTable,
-    geometry: GeometryTable,
+    geometry: GeometryTables,
     vertices: VertexTable,
     diffuse: wp.array2d(dtype=wp.vec3),  # (world, vertex)
     glossy: wp.array2d(dtype=wp.vec3),  # (world, vertex)
@@ -85,8 +85,8 @@ def _interpolate_vertices(
     slot += first
     entity = pixels.entity[world, slot]
     if entity >= 0:
-        mesh = geometry.entity_mesh[entity]
-        corners = geometry.faces[geometry.first_face[mesh] + pixels.face[world, slot]]
+        mesh = geometry[0].entity_mesh[entity]
+        corners = geometry[0].faces[geometry[0].first_face[mesh] + pixels.face[world, slot]]
         start = vertices.first[entity]
         uv = pixels.uv[world, slot]
         a = start + corners[0]

@@ -7,8 +7,8 @@ looks at the receiver. Both are shares that change smoothly as the bodies move, 
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTable, PoseTable
-from warp_psf.shade.patches import Patches, PatchTable, axis_vector, slab_from_world, slab_origin
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
+from warp_psf.shade.patches import Patches, PatchTables, axis_vector, slab_from_world, slab_origin
 
 # The least half-extent over which a body passes through a plane, in units of its half-diagonal: a flat one is on one
 # side or the other.
@@ -33,27 +33,27 @@ class Extent:
 
 
 @wp.func
-def extent_of(world: int, entity: int, geometry: GeometryTable, poses: PoseTable) -> Extent:
+def extent_of(world: int, entity: int, geometry: GeometryTables, poses: PoseTables) -> Extent:
     """An entity's bounding box: its sphere would reach below the floor on which it stands."""
-    lower = geometry.lower[entity]
-    upper = geometry.upper[entity]
-    rotation = poses.rotation[world, entity]
+    lower = geometry[0].lower[entity]
+    upper = geometry[0].upper[entity]
+    rotation = poses[0].rotation[world, entity]
     extent = Extent()
-    extent.center = poses.position[world, entity] + rotation * (0.5 * (lower + upper))
+    extent.center = poses[0].position[world, entity] + rotation * (0.5 * (lower + upper))
     extent.axes = rotation * wp.diag(0.5 * (upper - lower))
     return extent
 
 
 @wp.func
-def extent_of_face(world: int, face: int, poses: PoseTable, patches: PatchTable) -> Extent:
+def extent_of_face(world: int, face: int, poses: PoseTables, patches: PatchTables) -> Extent:
     """The part of a face that sends out light."""
-    entity = patches.entity[face]
-    axis = patches.axis[face]
-    part = patches.part[world, face]
+    entity = patches[0].entity[face]
+    axis = patches[0].axis[face]
+    part = patches[0].part[world, face]
     to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
     u = axis_vector((axis + 1) % 3)
     v = axis_vector((axis + 2) % 3)
-    middle = part[0] * u + part[2] * v + patches.side[face] * patches.half[face][2] * axis_vector(axis)
+    middle = part[0] * u + part[2] * v + patches[0].side[face] * patches[0].half[face][2] * axis_vector(axis)
     extent = Extent()
     extent.center = slab_origin(world, entity, poses, patches) + to_world * middle
     extent.axes = to_world * wp.diag(part[1] * u + part[3] * v)
@@ -75,17 +75,17 @@ def part_behind(extent: Extent, n: wp.vec3, height: float) -> float:
 
 
 @wp.func
-def normal_of(world: int, face: int, poses: PoseTable, patches: PatchTable) -> wp.vec3:
+def normal_of(world: int, face: int, poses: PoseTables, patches: PatchTables) -> wp.vec3:
     """The outward normal of a face, in the world."""
-    to_slab = slab_from_world(world, patches.entity[face], poses, patches)
-    return patches.side[face] * (wp.transpose(to_slab) * axis_vector(patches.axis[face]))
+    to_slab = slab_from_world(world, patches[0].entity[face], poses, patches)
+    return patches[0].side[face] * (wp.transpose(to_slab) * axis_vector(patches[0].axis[face]))
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _relate(first: int, geometry: GeometryTable, poses: PoseTable, patches: PatchTable, relations: RelationTable):
+def _relate(first: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables, relations: RelationTable):
     world, source = wp.tid()
     source += first
-    faces = patches.entity.shape[0]
+    faces = patches[0].entity.shape[0]
     extent = Extent()
     if source < faces:
         extent = extent_of_face(world, source, poses, patches)
@@ -102,13 +102,13 @@ def _relate(first: int, geometry: GeometryTable, poses: PoseTable, patches: Patc
 
 
 @wp.func
-def faces_ahead(world: int, entity: int, p: wp.vec3, poses: PoseTable, patches: PatchTable) -> int:
+def faces_ahead(world: int, entity: int, p: wp.vec3, poses: PoseTables, patches: PatchTables) -> int:
     """Bit k is set when p lies before the slab's face k; 0 for what is no slab."""
-    first = patches.first_face[entity]
+    first = patches[0].first_face[entity]
     ahead = int(0)
     if first >= 0:
         p_slab = slab_from_world(world, entity, poses, patches) * (p - slab_origin(world, entity, poses, patches))
-        half = patches.slab_half[entity]
+        half = patches[0].slab_half[entity]
         for axis in range(3):
             if p_slab[axis] >= half[axis]:
                 ahead += 1 << (2 * axis)
@@ -128,31 +128,25 @@ def hidden_part(world: int, source: int, first_face: int, ahead: int, relations:
 
 
 @wp.func
-def hides_face(world: int, entity: int, ahead: int, face: int, patches: PatchTable, relations: RelationTable) -> float:
+def hides_face(world: int, entity: int, ahead: int, face: int, patches: PatchTables, relations: RelationTable) -> float:
     """How far an entity lies between a point and a face of another. ahead: the entity's faces before which p lies."""
     share = relations.before[world, face, entity]
     if share > 0.0 and ahead > 0:
-        share = wp.min(share, hidden_part(world, face, patches.first_face[entity], ahead, relations))
+        share = wp.min(share, hidden_part(world, face, patches[0].first_face[entity], ahead, relations))
     return share
 
 
 @wp.func
 def hides_body(
-    world: int,
-    entity: int,
-    ahead: int,
-    body: int,
-    further: float,
-    patches: PatchTable,
-    relations: RelationTable,
+    world: int, entity: int, ahead: int, body: int, further: float, patches: PatchTables, relations: RelationTable
 ) -> float:
     """How far an entity in the same direction lies between a point and a body that is no slab.
 
     ahead: as for `hides_face`. further: how much farther away the body is, in units of both radii together.
     """
     if ahead > 0:
-        source = patches.entity.shape[0] + body
-        return hidden_part(world, source, patches.first_face[entity], ahead, relations)
+        source = patches[0].entity.shape[0] + body
+        return hidden_part(world, source, patches[0].first_face[entity], ahead, relations)
     return wp.clamp(0.5 + further, 0.0, 1.0)
 
 
@@ -167,5 +161,5 @@ def make_relations(patches: Patches, entities: int, worlds: int, device: wp.Devi
 
 def relate(relations: RelationTable, patches: Patches, scene: DeviceScene, device: wp.Device) -> None:
     """Works out the relations of a frame, after `place_texels`."""
-    inputs = [scene.geometry, scene.poses, patches.table]
+    inputs = [scene.geometry, scene.poses, patches.tables]
     launch(_relate, relations.behind.shape[:2], inputs, [relations], device)
