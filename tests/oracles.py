@@ -15,6 +15,7 @@ from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import make_receivers
 from warp_psf.shade.direct import shade_direct
 from warp_psf.shade.occluders import turn_occlusion
+from warp_psf.shade.spheres import choose_cuts, make_cuts
 
 # Rays start this far off the surface, metres: the models under test are centimetres to metres large.
 RAY_OFFSET = 1e-4
@@ -59,6 +60,13 @@ def world_triangles(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndar
     return np.concatenate(vertices), np.concatenate(faces), np.concatenate(geoms)
 
 
+def loose_triangles(renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
+    """What the last picture showed of things without a rigid shape, in the world: vertices [V, 3] and faces [F, 3]."""
+    stage = renderer._stage
+    mesh = stage.device_scene.meshes[stage.scene.entities[stage.scene.loose].mesh]
+    return mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3)
+
+
 def traced_irradiance(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -66,13 +74,18 @@ def traced_irradiance(
     normals: np.ndarray,
     coefficients: np.ndarray,
     rays: int = 4096,
+    loose: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
     """Irradiance [N, 3] at points with normals [N, 3] from an environment on SH, past everything, by ray casting.
 
-    coefficients: of the environment's radiance, [order^2, 3]. rays: directions over the whole sphere.
+    coefficients: of the environment's radiance, [order^2, 3]. rays: directions over the whole sphere. loose: vertices
+    and faces of what has no rigid shape, see `loose_triangles`.
     """
     device = find_device()
     vertices, faces, _ = world_triangles(model, data)
+    if loose is not None:
+        faces = np.concatenate([faces, loose[1] + len(vertices)])
+        vertices = np.concatenate([vertices, loose[0]])
     mesh = wp.Mesh(
         points=wp.array(vertices, dtype=wp.vec3, device=device),
         indices=wp.array(faces.reshape(-1), dtype=wp.int32, device=device),
@@ -131,7 +144,10 @@ def shade_points(renderer: Renderer, geom: str, points: np.ndarray, normals: np.
     turns = wp.full((1, count), 1, dtype=wp.int32, device=device)
     turn_occlusion(renderer._stage.occlusion, renderer._stage.device_scene, device)
     lights = (renderer._stage.occlusion, renderer._stage.lighting)
-    shade_direct(receivers, turns, 1, renderer._stage.device_scene, *lights, *received, device)
+    spheres = renderer._stage.spheres
+    cuts = make_cuts(1, count, bool(spheres.sets), device)
+    choose_cuts(cuts, receivers, spheres, device)
+    shade_direct(receivers, turns, 1, renderer._stage.device_scene, *lights, cuts, *received, device)
     return tuple(array.numpy()[0] for array in received)
 
 

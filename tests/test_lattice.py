@@ -44,6 +44,7 @@ def shade_everything(renderer) -> tuple[np.ndarray, np.ndarray]:
         1,
         renderer._stage.device_scene,
         *lights,
+        renderer._stage.cuts.pixels,
         *received,
         renderer._settings.device,
     )

@@ -17,7 +17,7 @@ from tests.oracles import (
 )
 from warp_psf.bake import body as bake_body
 from warp_psf.basis import sh
-from warp_psf.shade.occlude import SMALLEST_SHARE
+from warp_psf.shade.fades import SMALLEST_SHARE
 
 UP = np.array((0.0, 0.0, 1.0))
 WHITE = np.ones((4, 8, 3))

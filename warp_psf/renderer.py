@@ -29,6 +29,7 @@ from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.geometry import write_loose
 from warp_psf.scene.light import Light
 from warp_psf.scene.loose import LooseRoom, make_room
+from warp_psf.shade.spheres import carry_spheres
 from warp_psf.stage import Progress, Settings, Stage, draw, place, set_stage, take_over
 
 ORDERS = (2, 3, 4, 5, 6)
@@ -326,11 +327,12 @@ class Renderer:
         if self._scene.ngeom > rigid:
             loose = read_loose(self._model, self._scene, self._shown, self._material_space, self._metres_per_pixel())
         if loose is not None and (stage.room is None or not stage.room.holds(loose)):
-            standing, self._standing = stage, self._set_stage(self._option_in_use, make_room(loose))
+            standing, self._standing = stage, self._set_stage(self._option_in_use, make_room(loose, stage.room))
             stage = self._stage
             take_over(stage, standing)
         if stage.room is not None:
             write_loose(stage.device_scene, stage.scene, loose)
+            carry_spheres(stage.spheres, loose)
         return stage
 
     def _first_room(self) -> LooseRoom | None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import warp as wp
 
 from warp_psf.bake import bake_radiance_field
-from warp_psf.bake.bodies import bake_bodies, bake_light, bake_logarithms
+from warp_psf.bake.bodies import bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
 from warp_psf.bake.kept import BakedBody
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import Film, make_film, resolve_pixels
@@ -33,6 +33,7 @@ from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice
 from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
+from warp_psf.shade.spheres import SphereState, choose_cuts, make_cuts, upload_spheres
 from warp_psf.shade.tint import tint_proxies
 
 Progress = Callable[[str, float], None]
@@ -59,6 +60,15 @@ class Settings:
     device: wp.Device
 
 
+@dataclass(frozen=True)
+class Cuts:
+    """Through the trees of blocker spheres, for what pixels see, for vertices and for proxies."""
+
+    pixels: wp.array
+    vertices: wp.array
+    proxies: wp.array
+
+
 @dataclass
 class Stage:
     """A scene on the device, with room for a frame of it.
@@ -75,6 +85,8 @@ class Stage:
     device_scene: DeviceScene
     textures: TextureTable
     occlusion: OcclusionState
+    spheres: SphereState
+    cuts: Cuts
     lighting: DirectState
     delta_lights: DeltaState
     surfaces: Surfaces
@@ -123,7 +135,10 @@ def set_stage(
             radiance = np.ones(len(light.mesh.faces), np.float32)
             fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
     device_scene = upload_scene(scene, 1, device)
-    occlusion = upload_occlusion(scene, fields, log_fields, order, 1, device)
+    shapes = () if room is None else room.shapes
+    sets = bake_sphere_sets(shapes, str(device), progress)
+    spheres = upload_spheres(shapes, sets, scene.loose, 1, device)
+    occlusion = upload_occlusion(scene, fields, log_fields, spheres.tables, order, 1, device)
     transfers = _transfers(bodies)
     shining = [(entity, light.radiance) for light, entity in area_lights]
     lighting = upload_lighting(scene, transfers, shining, order, 1, device)
@@ -155,6 +170,8 @@ def set_stage(
         device_scene=device_scene,
         textures=upload_textures(scene, device),
         occlusion=occlusion,
+        spheres=spheres,
+        cuts=_make_cuts(bool(spheres.sets), surfaces, vertices, bounces, device),
         lighting=lighting,
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
         surfaces=surfaces,
@@ -218,9 +235,10 @@ def _shade_pixels(stage: Stage) -> None:
     scene, device, pixels = stage.device_scene, stage.settings.device, stage.surfaces.receivers
     lattice, lights = stage.lattice, (stage.occlusion, stage.lighting)
     with _timed(stage, "shadow fields"):
+        choose_cuts(stage.cuts.pixels, pixels, stage.spheres, device)
         begin_lattice(lattice, pixels, stage.surfaces.extra, device)
         for turn in range(1, len(STRIDES) + 1):
-            shade_direct(pixels, lattice.turns, turn, scene, *lights, *stage.received, device)
+            shade_direct(pixels, lattice.turns, turn, scene, *lights, stage.cuts.pixels, *stage.received, device)
             if turn < len(STRIDES):
                 refine_lattice(lattice, turn, pixels, *stage.received, device)
 
@@ -231,7 +249,8 @@ def _shade_vertices(stage: Stage, vertices: VertexReceivers, received: Received)
         place_vertices(vertices, pixels, scene, device)
     with _timed(stage, "shadow fields"):
         lights = (stage.occlusion, stage.lighting)
-        shade_direct(vertices.receivers, vertices.turns, 1, scene, *lights, *received, device)
+        choose_cuts(stage.cuts.vertices, vertices.receivers, stage.spheres, device)
+        shade_direct(vertices.receivers, vertices.turns, 1, scene, *lights, stage.cuts.vertices, *received, device)
     with _timed(stage, "interpolate vertices"):
         interpolate_vertices(vertices, pixels, scene, received, *stage.received, device)
     # Every pixel receives bounced light by itself.
@@ -247,8 +266,10 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
             tint_proxies(bounces, scene, stage.textures, device)
         stage.has_moved = False
     with _timed(stage, "light on proxies"):
-        shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, *bounces.received, device)
-        shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, stage.delta_lights, bounces.received[0], device)
+        cuts, received = stage.cuts.proxies, bounces.received
+        choose_cuts(cuts, bounces.proxies, stage.spheres, device)
+        shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, cuts, *received, device)
+        shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, cuts, stage.delta_lights, received[0], device)
         opacity, eye = stage.occlusion.table.occluders.opacity, stage.lighting.table.eye
         add_delta_lights(bounces.proxies, scene, opacity, eye, stage.delta_lights, *bounces.received, device)
     with _timed(stage, "bounces"):
@@ -267,6 +288,7 @@ def _make_see_through(stage: Stage) -> None:
     slots = stage.surfaces.slots
     stage.lattice = make_lattice(1, slots, *size, device)
     stage.received, stage.bounced = make_received(slots, device), make_received(slots, device)
+    stage.cuts = replace(stage.cuts, pixels=make_cuts(1, slots, bool(stage.spheres.sets), device))
     if stage.bounces is not None:
         stage.last_gather = make_last_gather(stage.bounces, settings.bounce_threshold, *size, slots, device)
 
@@ -285,6 +307,19 @@ def _transfers(bodies: list[BakedBody]) -> list[tuple[np.ndarray, np.ndarray] | 
         None if body.transfer is None or body.visibility is None else (body.transfer, body.visibility)
         for body in bodies
     ]
+
+
+def _make_cuts(
+    has_spheres: bool,
+    surfaces: Surfaces,
+    vertices: VertexReceivers | None,
+    bounces: BounceState | None,
+    device: wp.Device,
+) -> Cuts:
+    of_vertices = 0 if vertices is None else vertices.receivers.entity.shape[1]
+    of_proxies = 0 if bounces is None else bounces.proxies.entity.shape[1]
+    counts = surfaces.slots, of_vertices, of_proxies
+    return Cuts(*(make_cuts(1, count, has_spheres, device) for count in counts))
 
 
 def make_received(count: int, device: wp.Device) -> Received:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from queue import SimpleQueue
@@ -14,9 +14,12 @@ from warp_psf.bake.kept import BakedBody
 from warp_psf.bake.logarithm import bake_logarithm
 from warp_psf.bake.radiance import BakedRadiance, bake_radiance
 from warp_psf.bake.shape import shape_key, unit_shape
+from warp_psf.bake.sphere_set import bake_shape_spheres
 from warp_psf.device import core_count, find_device
 from warp_psf.field.shells import ShadowField
+from warp_psf.field.spheres import SphereSet
 from warp_psf.scene.detail import refine_radiating
+from warp_psf.scene.loose import DeformingShape
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
 
@@ -79,6 +82,16 @@ def bake_logarithms(scene: Scene, bodies: list[BakedBody], progress: Progress) -
         if body.field is not None:
             progress(f"taking logarithms of {mesh.name}", 1.0)
     return logarithms
+
+
+def bake_sphere_sets(shapes: Sequence[DeformingShape], device: str, progress: Progress) -> tuple[SphereSet, ...]:
+    """The blocker spheres of shapes that deform, bound to their vertices."""
+    sets = []
+    for shape in shapes:
+        progress(f"fitting spheres to {shape.name}", 0.0)
+        sets.append(bake_shape_spheres(shape, device=device))
+        progress(f"fitting spheres to {shape.name}", 1.0)
+    return tuple(sets)
 
 
 def _casting(scene: Scene, casts: list[bool]) -> list[int]:

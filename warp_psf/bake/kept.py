@@ -115,13 +115,13 @@ def _load(
     if arrays is None:
         return None
     layout = layout | {"resolutions": (np.int32, (shells,)), "surface": (np.float32, (len(unit.vertices), 6))}
-    wrong = _find_unlike(arrays, layout)
+    wrong = find_unlike(arrays, layout)
     if wrong is None:
         samples = int((arrays["resolutions"].astype(np.int64) ** 2).sum())
         if not np.isin(arrays["resolutions"], RESOLUTIONS).all():
             wrong = "resolutions"
         else:
-            wrong = _find_unlike(arrays, {"codes": (np.uint8, (samples, *vector))})
+            wrong = find_unlike(arrays, {"codes": (np.uint8, (samples, *vector))})
     if wrong is None:
         wrong = min(arrays.keys() - layout.keys() - {"codes"}, default=None)
     if wrong is not None:
@@ -136,7 +136,7 @@ def _say_wrong(what: str, mesh: Mesh, name: str) -> None:
     warnings.warn(message, stacklevel=5)
 
 
-def _find_unlike(arrays: dict[str, np.ndarray], layout: dict[str, tuple[type, tuple[int, ...] | None]]) -> str | None:
+def find_unlike(arrays: dict[str, np.ndarray], layout: dict[str, tuple[type, tuple[int, ...] | None]]) -> str | None:
     """The name of an array that is missing, not finite, or of another type or shape than laid out, or None.
 
     An array whose shape is laid out as None may have any.
@@ -145,6 +145,6 @@ def _find_unlike(arrays: dict[str, np.ndarray], layout: dict[str, tuple[type, tu
         array = arrays.get(name)
         if array is None or array.dtype != dtype or shape not in (None, array.shape):
             return name
-        if dtype is np.float32 and not np.isfinite(array).all():
+        if np.issubdtype(dtype, np.floating) and not np.isfinite(array).all():
             return name
     return None

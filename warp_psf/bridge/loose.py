@@ -17,6 +17,7 @@ GEOM, OBJECT = mujoco.mjtGeom, mujoco.mjtObj
 # MuJoCo's arrows: how much wider the head is than the shaft.
 HEAD = 1.75
 DECOR = mujoco.mjtCatBit.mjCAT_DECOR
+DEFORMING = (int(OBJECT.mjOBJ_FLEX), int(OBJECT.mjOBJ_SKIN))
 
 
 def read_loose(
@@ -55,6 +56,8 @@ def read_loose(
         faces.astype(np.int32),
         np.repeat(np.arange(len(parts)), [len(faces) for _, _, faces in surfaces]).astype(np.int32),
         tuple(parts),
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.array([part.object_type in DEFORMING for part in parts]),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from warp_psf.scene.material import Material
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Entity, Part
+from warp_psf.scene.topology import area_vectors
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +19,8 @@ class Loose:
     vertices: metres, float32 [V, 3]. normals: unit, float32 [V, 3]. faces: int32 [F, 3].
     face_part: which part each face belongs to, int32 [F].
     parts: what the viewer tells apart.
+    first_vertex: where each part's vertices begin, and where the last one's end, int [parts + 1].
+    deforming: per part whether it is a body that deforms and casts shadows (a skin or a flex), bool.
     """
 
     vertices: np.ndarray
@@ -25,15 +28,35 @@ class Loose:
     faces: np.ndarray
     face_part: np.ndarray
     parts: tuple[Part, ...]
+    first_vertex: np.ndarray
+    deforming: np.ndarray
+
+    def shape(self, name: str, vertices: int) -> np.ndarray | None:
+        """Where the vertices of the deforming body of this name are, [V, 3]; None if it does not have so many."""
+        for index in np.flatnonzero(self.deforming):
+            rows = slice(*self.first_vertex[index : index + 2])
+            if self.parts[index].name == name and rows.stop - rows.start == vertices:
+                return self.vertices[rows]
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class DeformingShape:
+    """A body that deforms, as it was when its room was made: metres, float32 [V, 3], and faces, int32 [F, 3]."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
 
 
 @dataclass(frozen=True)
 class LooseRoom:
-    """How much of it there is room for."""
+    """How much of it there is room for, and the deforming bodies in it that cast shadows."""
 
     vertices: int
     faces: int
     parts: int
+    shapes: tuple[DeformingShape, ...]
 
     def holds(self, loose: Loose) -> bool:
         """Whether there is room for all of this."""
@@ -41,9 +64,21 @@ class LooseRoom:
         return all(size <= room for size, room in zip(sizes, (self.vertices, self.faces, self.parts), strict=True))
 
 
-def make_room(loose: Loose) -> LooseRoom:
-    """Room for this and half as much again: tendons wrap around more or fewer things from frame to frame."""
-    return LooseRoom(*(max(16, size + size // 2) for size in (len(loose.vertices), len(loose.faces), len(loose.parts))))
+def make_room(loose: Loose, before: LooseRoom | None = None) -> LooseRoom:
+    """Room for this and half as much again: tendons wrap around more or fewer things from frame to frame.
+
+    before: a room that has become too small. Bodies that were in it keep the shape that they had when it was made.
+    """
+    known = {} if before is None else {(shape.name, len(shape.vertices)): shape for shape in before.shapes}
+    shapes = []
+    for index in np.flatnonzero(loose.deforming):
+        start, end = loose.first_vertex[index : index + 2]
+        name, faces = loose.parts[index].name, loose.faces[loose.face_part == index] - start
+        shape = known.get((name, end - start)) or DeformingShape(name, loose.vertices[start:end], faces)
+        if area_vectors(shape.vertices, shape.faces).any():  # what has no surface casts no shadow
+            shapes.append(shape)
+    sizes = (max(16, size + size // 2) for size in (len(loose.vertices), len(loose.faces), len(loose.parts)))
+    return LooseRoom(*sizes, shapes=tuple(shapes))
 
 
 def reserve(room: LooseRoom, mesh: int) -> tuple[Mesh, Entity]:

@@ -18,6 +18,7 @@ from warp_psf.scene.scene import Scene
 from warp_psf.shade.area import make_area
 from warp_psf.shade.occlude import make_occlude
 from warp_psf.shade.occluders import OcclusionState
+from warp_psf.shade.spheres import CutTables
 
 
 @cache
@@ -201,6 +202,7 @@ def make_direct(order: int) -> SimpleNamespace:
         poses: PoseTables,
         o: OcclusionTables,
         lighting: LightingTables,
+        cuts: CutTables,
         diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, receiver): irradiance
         glossy_out: wp.array2d(dtype=wp.vec3),  # (world, receiver): radiance through the normalised Phong lobe
     ):
@@ -220,7 +222,7 @@ def make_direct(order: int) -> SimpleNamespace:
         if lights > 0:
             shining = lighting[0].light_entity[0]
         facing = facing_of(world, 0, poses, lighting)
-        visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
+        visible, before = kit.visibility_at(world, receiver, entity, shining, facing, p, n, geometry, poses, o, cuts)
         diffuse = environment_light(world, wp.cw_mul(visible, transfer), lighting)
         glossy = wp.vec3()
         lobe = values()
@@ -235,7 +237,9 @@ def make_direct(order: int) -> SimpleNamespace:
             if light > 0:
                 shining = lighting[0].light_entity[light]
                 facing = facing_of(world, light, poses, lighting)
-                _visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
+                _visible, before = kit.visibility_at(
+                    world, receiver, entity, shining, facing, p, n, geometry, poses, o, cuts
+                )
             passed = wp.cw_mul(before, open_share)
             irradiance, gloss = area_light(world, light, surface, passed, lobe, geometry, poses, o, lighting)
             diffuse += irradiance * lighting[0].light_radiance[world, light]
@@ -332,16 +336,18 @@ def shade_direct(
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
+    cuts: wp.array,
     diffuse: wp.array,
     glossy: wp.array,
     device: wp.Device,
 ) -> None:
     """Writes the irradiance of the receivers whose turn it is, and their radiance through the Phong lobe.
 
-    turns: int32 (worlds, receivers). diffuse, glossy: vec3 (worlds, receivers); the others' values stay.
+    turns: int32 (worlds, receivers). cuts: of the receivers, see `choose_cuts`. diffuse, glossy: vec3 (worlds,
+    receivers); the others' values stay.
     """
     kit = make_direct(lighting.order)
-    inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.tables, lighting.tables]
+    inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.tables, lighting.tables, cuts]
     launch(kit.shade_receivers, diffuse.shape, inputs, [diffuse, glossy], device)
 
 

@@ -23,6 +23,7 @@ from warp_psf.shade.direct import DirectState
 from warp_psf.shade.faces import make_faces
 from warp_psf.shade.occluders import OcclusionState
 from warp_psf.shade.patches import PatchTables, slab_from_world, slab_origin
+from warp_psf.shade.spheres import CutTables
 from warp_psf.shade.tables import make_tables
 
 
@@ -117,6 +118,7 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         poses: PoseTables,
         o: OcclusionTables,
         lighting: LightingTables,
+        cuts: CutTables,
         gloss: GlossTable,
         irradiance_out: wp.array2d(dtype=wp.vec3),  # (world, proxy)
     ):
@@ -134,7 +136,7 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
         if lights > 0:
             shining = lighting[0].light_entity[0]
         facing = kit.facing_of(world, 0, poses, lighting)
-        visible, before = kit.visibility_at(world, entity, shining, facing, p, n, geometry, poses, o)
+        visible, before = kit.visibility_at(world, proxy, entity, shining, facing, p, n, geometry, poses, o, cuts)
         received = wp.cw_mul(visible, transfer)
         irradiance = kit.environment_light(world, received, lighting)
         moment = wp.mat33()
@@ -147,7 +149,9 @@ def make_gloss(order: int, functions: int) -> SimpleNamespace:
             source = lighting[0].light_entity[light]
             if light > 0:
                 facing = kit.facing_of(world, light, poses, lighting)
-                _visible, before = kit.visibility_at(world, entity, source, facing, p, n, geometry, poses, o)
+                _visible, before = kit.visibility_at(
+                    world, proxy, entity, source, facing, p, n, geometry, poses, o, cuts
+                )
             passed = wp.cw_mul(before, open_to_self)
             strength, _gloss = kit.area_light(world, light, surface, passed, values(), geometry, poses, o, lighting)
             center = poses[0].position[world, source] + poses[0].rotation[world, source] * geometry[0].center[source]
@@ -316,6 +320,7 @@ def shade_gloss(
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
+    cuts: wp.array,
     delta: DeltaState,
     irradiance: wp.array,
     device: wp.Device,
@@ -323,7 +328,7 @@ def shade_gloss(
     """Direct light of the glossy proxies: its moment, and `irradiance`, vec3 (world, proxy), but for delta lights."""
     kit = make_gloss(state.order, state.functions)
     shape = state.table.moment.shape
-    inputs = [proxies, scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.table]
+    inputs = [proxies, scene.geometry, scene.poses, occlusion.tables, lighting.tables, cuts, state.table]
     launch(kit.shade_moments, shape, inputs, [irradiance], device)
     if delta.table.kind.shape[1] > 0:
         opacity = occlusion.table.occluders.opacity

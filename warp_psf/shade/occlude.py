@@ -12,21 +12,13 @@ import warp as wp
 from warp_psf.basis.sh_exp import make_sh_exp
 from warp_psf.scene.geometry import GeometryTables, PoseTables
 from warp_psf.shade.coverage import SLAB_SHAPE
+from warp_psf.shade.fades import Light, before_plane, fade_length, horizon_fade, size_fade, sphere_nearness
 from warp_psf.shade.occluders import make_occluders
+from warp_psf.shade.spheres import CLUSTER, CutTables, make_spheres
 
-# An occluder whose bounding sphere could take less than this share of a diffuse receiver's light is left out: seen
-# face-on a sphere of radius R at distance d takes (R/d)^2. It fades in up to twice the share, so that nothing pops.
-SMALLEST_SHARE = 1.0e-3
-# A body whose bounding sphere lies below the receiver's horizon is left out too: what band-limited functions let
-# through there is not real. It fades in as it rises by this share of its radius; slabs have a horizon of their own.
-HORIZON_FADE = 0.6
 # A slab whose corners rise above the receiver's tangent plane by less than this share of its half-diagonal counts as
 # below it: the floor beside a receiver on the same floor.
 SLAB_HORIZON = 1.0e-5
-# What can stand between a receiver and a light and what cannot is told by planes: of a slab's faces, when both lie
-# before one, and of a flat light, when an occluder lies behind it. At a plane occluders fade over this share of the
-# light's radius.
-LIGHT_FADE = 0.25
 
 
 @cache
@@ -36,15 +28,7 @@ def make_occlude(order: int) -> SimpleNamespace:
     values, OcclusionTables, logs = kit.values, kit.OcclusionTables, make_sh_exp(order)
     # Of the environment and of a light.
     both_values = wp.types.matrix((2, kit.points), wp.float32)
-    both_logarithms = wp.types.matrix((2, order * order), wp.float32)
-
-    @wp.struct
-    class Light:
-        """An area light, for telling what is nearer."""
-
-        center: wp.vec3  # of its bounding sphere, in the world
-        radius: wp.float32  # of that, metres; below 0 where no light is asked for
-        facing: wp.vec3  # the side to which a flat light shines; zero for others
+    both_logarithms, add_sphere = make_spheres(order).both_logarithms, make_spheres(order).add_sphere
 
     @wp.func_native(_multiply_snippet(kit.points))
     def multiply(visible: both_values, covered: values, weights: wp.vec2) -> both_values: ...
@@ -68,15 +52,13 @@ def make_occlude(order: int) -> SimpleNamespace:
         height = wp.dot(n, offset)
         if height < -radius:
             return 0.0
-        share = radius * radius / wp.max(wp.dot(offset, offset), 1.0e-12)
-        size = opacity * wp.clamp(share / wp.static(SMALLEST_SHARE) - 1.0, 0.0, 1.0)
+        size = opacity * size_fade(radius, wp.dot(offset, offset))
         if o[0].occluders.shape[entity] == wp.static(SLAB_SHAPE):
             half = o[0].occluders.slab_half[entity]
             n_slab = wp.transpose(rotation * o[0].occluders.slab_rotation[entity]) * n
             rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
             return size * wp.where(height + rise > wp.static(SLAB_HORIZON) * radius, 1.0, 0.0)
-        risen = wp.min((height + radius) / (wp.static(HORIZON_FADE) * radius), 1.0)
-        return size * risen * risen * (3.0 - 2.0 * risen)
+        return size * horizon_fade(height, radius)
 
     @wp.func
     def nearness(
@@ -90,38 +72,22 @@ def make_occlude(order: int) -> SimpleNamespace:
         o: OcclusionTables,
     ) -> float:
         """How far an entity is nearer to p than a light: 1 in front of it, 0 behind it, smooth between."""
-        # Nothing behind a flat light's plane stands in its way, however near it is: a ceiling above a lamp. What comes
-        # out from behind fades in.
-        ahead_of_light = wp.dot(light.facing, center - light.center)
-        if o[0].occluders.shape[entity] == wp.static(SLAB_SHAPE):
-            half = o[0].occluders.slab_half[entity]
-            facing_slab = wp.transpose(rotation * o[0].occluders.slab_rotation[entity]) * light.facing
-            ahead_of_light += (
-                wp.abs(facing_slab[0]) * half[0] + wp.abs(facing_slab[1]) * half[1] + wp.abs(facing_slab[2]) * half[2]
-            )
-        else:
-            ahead_of_light += radius
-        fade = wp.max(wp.static(LIGHT_FADE) * light.radius, 1.0e-9)
-        before = float(1.0)
-        if wp.length_sq(light.facing) > 0.0:
-            before = wp.clamp(ahead_of_light / fade, 0.0, 1.0)
-        if o[0].occluders.shape[entity] == wp.static(SLAB_SHAPE):
-            to_slab = wp.transpose(rotation * o[0].occluders.slab_rotation[entity])
-            origin = position + rotation * o[0].occluders.slab_center[entity]
-            p_slab = to_slab * (p - origin)
-            light_slab = to_slab * (light.center - origin)
-            half = o[0].occluders.slab_half[entity]
-            apart = float(-1.0e30)
-            for axis in range(3):
-                side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
-                ahead = wp.min(side * p_slab[axis], side * light_slab[axis] - light.radius) - half[axis]
-                apart = wp.max(apart, ahead)
-            return before * (1.0 - wp.clamp(apart / fade, 0.0, 1.0))
-        return before * wp.clamp(
-            0.5 + (wp.length(light.center - p) - wp.length(center - p)) / wp.max(light.radius + radius, 1.0e-9),
-            0.0,
-            1.0,
-        )
+        if o[0].occluders.shape[entity] != wp.static(SLAB_SHAPE):
+            return sphere_nearness(p, center, radius, light)
+        half = o[0].occluders.slab_half[entity]
+        to_slab = wp.transpose(rotation * o[0].occluders.slab_rotation[entity])
+        facing_slab = to_slab * light.facing
+        reach = wp.abs(facing_slab[0]) * half[0] + wp.abs(facing_slab[1]) * half[1] + wp.abs(facing_slab[2]) * half[2]
+        before = before_plane(wp.dot(light.facing, center - light.center) + reach, light)
+        origin = position + rotation * o[0].occluders.slab_center[entity]
+        p_slab = to_slab * (p - origin)
+        light_slab = to_slab * (light.center - origin)
+        apart = float(-1.0e30)
+        for axis in range(3):
+            side = wp.where(p_slab[axis] < 0.0, -1.0, 1.0)
+            ahead = wp.min(side * p_slab[axis], side * light_slab[axis] - light.radius) - half[axis]
+            apart = wp.max(apart, ahead)
+        return before * (1.0 - wp.clamp(apart / fade_length(light), 0.0, 1.0))
 
     @wp.func
     def weights_of(
@@ -199,6 +165,7 @@ def make_occlude(order: int) -> SimpleNamespace:
     @wp.func
     def visibility_at(
         world: int,
+        receiver: int,
         own: int,
         light_entity: int,
         light_facing: wp.vec3,
@@ -207,10 +174,11 @@ def make_occlude(order: int) -> SimpleNamespace:
         geometry: GeometryTables,
         poses: PoseTables,
         o: OcclusionTables,
+        cuts: CutTables,
     ):
         """Visibility past every entity but `own`, and past those nearer than a light, -1 for none.
 
-        light_facing: the side to which a flat light shines, in the world; zero for others.
+        receiver: its number among those of `cuts`. light_facing: see `Light`.
         """
         light = Light()
         light.radius = -1.0
@@ -223,10 +191,16 @@ def make_occlude(order: int) -> SimpleNamespace:
         entities = geometry[0].entity_mesh.shape[0]
         for entity in range(entities):
             visible = pass_entity(visible, world, entity, own, p, n, light, geometry, poses, o)
+        logarithms = both_logarithms()
         if o[0].added > 0:
-            logarithms = both_logarithms()
             for entity in range(entities):
                 logarithms = add_entity(logarithms, world, entity, own, p, n, light, geometry, poses, o)
+        if cuts[0].count.shape[1] > 0:
+            cluster = receiver / wp.static(CLUSTER)
+            for place in range(cuts[0].count[world, cluster]):
+                node = cuts[0].node[world, cluster, place]
+                logarithms = add_sphere(logarithms, world, node, own, p, n, light, o[0].spheres, o[0].exponential)
+        if logarithms[0, 0] != 0.0:
             left = logs.exponential_at_directions(logarithms[0], o[0].exponential)
             visible[0] = wp.cw_mul(visible[0], left)
             if light_entity >= 0:

@@ -17,6 +17,7 @@ from warp_psf.basis.directions import quadrature_rows, quadrature_weights
 from warp_psf.basis.sh_exp import make_sh_exp, upload_exponential
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.shells import ShadowField, make_fields, upload_fields
+from warp_psf.field.spheres import SphereTables
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
@@ -51,6 +52,7 @@ def make_occluders(order: int) -> SimpleNamespace:
         turns: wp.array3d(dtype=vec)
         exponential: wp.array(dtype=ExpTable)  # (1)
         added: wp.int32  # entities whose logarithms are added
+        spheres: SphereTables
 
     OcclusionTables = wp.array(dtype=Occlusion)
 
@@ -171,6 +173,7 @@ def upload_occlusion(
     scene: Scene,
     fields: list[ShadowField | None],
     log_fields: list[ShadowField | None] | None,
+    spheres: wp.array,
     order: int,
     worlds: int,
     device: wp.Device,
@@ -181,6 +184,7 @@ def upload_occlusion(
     log_fields: per entity its log shadow field likewise, for composing by logarithms; None for composing by products.
         Boxes are multiplied even so, because their coverage has a closed form and its logarithm has none, and bodies
         that light passes through, whose visibility is 1 minus a share of the coverage.
+    spheres: the `SphereTable` of its sphere sets, as an array of one.
     """
     kit = make_occluders(order)
     shape_of_rows = (worlds, len(scene.entities), order * order)
@@ -195,7 +199,7 @@ def upload_occlusion(
     tables = [coverage, upload_fields(distinct, order, device)]
     table.fields = upload_tables(tables, make_fields(order).FieldTable, device)
     table.turns = wp.zeros(shape_of_rows, dtype=kit.vec, device=device)
-    table.exponential = upload_exponential(order, device)
+    table.exponential, table.spheres = upload_exponential(order, device), spheres
     tables = upload_tables([table], kit.Occlusion, device)
     half = slice(0, kit.points // 2)
     directions = sphere.quadrature(kit.points)[0][half]

@@ -1,0 +1,188 @@
+"""Sphere sets as occluders: receivers that lie together share a cut through the trees of spheres (Ren 2006).
+
+Far from a body a few spheres stand for all, near it each stands for itself. The logarithms of the cut's spheres are
+added at each receiver, with what a log shadow field has left.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis.sh_exp import make_sh_exp
+from warp_psf.device import launch, upload_tables
+from warp_psf.field.spheres import SphereSet, SphereTable, SphereTables, place_nodes
+from warp_psf.scene.loose import DeformingShape, Loose
+from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.shade.fades import SMALLEST_SHARE, Light, horizon_fade, size_fade, sphere_nearness
+
+# Receivers of a cluster, which share a cut: neighbours in a row of pixels, or on a body.
+CLUSTER = 64
+# A sphere stands for those under it where it spans no more than this sine: a third of what four bands resolve.
+CUT_SINE = 0.25
+# Spheres in a cut; where more would be, coarser ones stand for them.
+MOST_IN_CUT = 256
+COARSER = 1.5
+# A body's own sphere takes no light from a receiver inside of it, which by the fit lies on the surface; it fades in
+# over this share of its radius outside.
+SELF_FADE = 0.5
+
+
+@wp.struct
+class CutTable:
+    """The cut of each cluster of some receivers."""
+
+    count: wp.array2d(dtype=wp.int32)  # (world, cluster)
+    node: wp.array3d(dtype=wp.int32)  # (world, cluster, place)
+
+
+CutTables = wp.array(dtype=CutTable)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _choose_cuts(first: int, receivers: ReceiverTable, spheres: SphereTables, cuts: CutTables):
+    world, cluster = wp.tid()
+    cluster += first
+    start = cluster * wp.static(CLUSTER)
+    end = wp.min(start + wp.static(CLUSTER), receivers.entity.shape[1])
+    lower = wp.vec3(1.0e30, 1.0e30, 1.0e30)
+    upper = -lower
+    for receiver in range(start, end):
+        if receivers.entity[world, receiver] >= 0:
+            lower = wp.min(lower, receivers.position[world, receiver])
+            upper = wp.max(upper, receivers.position[world, receiver])
+    count = int(0)
+    if lower[0] <= upper[0]:
+        middle = 0.5 * (lower + upper)
+        reach = 0.5 * wp.length(upper - lower)
+        largest = float(wp.static(CUT_SINE))
+        nodes = spheres[0].leaves.shape[0]
+        fits = bool(False)
+        while not fits:
+            fits = bool(True)
+            count = int(0)
+            node = int(0)
+            while node < nodes and fits:
+                leaves = spheres[0].leaves[node]
+                radius = spheres[0].radius[world, node]
+                away = wp.max(wp.length(spheres[0].center[world, node] - middle) - reach, 0.0)
+                if spheres[0].weight[world, node] <= 0.0 or radius * radius < wp.static(SMALLEST_SHARE) * away * away:
+                    node += 2 * leaves - 1
+                elif leaves == 1 or radius <= largest * away:
+                    # Where even the roots are too many, those behind are left out.
+                    fits = count < wp.static(MOST_IN_CUT) or largest >= 1.0e3
+                    if count < wp.static(MOST_IN_CUT):
+                        cuts[0].node[world, cluster, count] = node
+                        count += 1
+                    node += 2 * leaves - 1
+                else:
+                    node += 1
+            largest *= wp.static(COARSER)
+    cuts[0].count[world, cluster] = count
+
+
+@cache
+def make_spheres(order: int) -> SimpleNamespace:
+    """The device function `add_sphere(...)` for `order` bands, and the type `both_logarithms` of its sums."""
+    logs = make_sh_exp(order)
+    ExpTables = wp.array(dtype=logs.ExpTable)
+    both_logarithms = wp.types.matrix((2, order * order), wp.float32)
+
+    @wp.func
+    def add_sphere(
+        logarithms: both_logarithms,
+        world: int,
+        node: int,
+        own: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        light: Light,
+        spheres: SphereTables,
+        exponential: ExpTables,
+    ) -> both_logarithms:
+        """Adds the logarithms of what a sphere leaves of the environment and of a light."""
+        radius = spheres[0].radius[world, node]
+        center = spheres[0].center[world, node]
+        offset = center - p
+        squared = wp.max(wp.dot(offset, offset), 1.0e-12)
+        weight = size_fade(radius, squared) * horizon_fade(wp.dot(n, offset), radius)
+        distance = wp.sqrt(squared)
+        if spheres[0].entity[node] == own:
+            weight *= wp.clamp((distance - radius) / (wp.static(SELF_FADE) * radius), 0.0, 1.0)
+        if weight <= 0.0:
+            return logarithms
+        # Spheres behind one another share what they take. One that takes up much of the view hides those behind it
+        # by itself.
+        sine = wp.min(radius / distance, 1.0)
+        shared = spheres[0].weight[world, node]
+        weight *= shared + wp.max(1.0 - shared, 0.0) * sine * sine
+        nearer = float(0.0)
+        if light.radius >= 0.0:
+            nearer = sphere_nearness(p, center, radius, light)
+        left = logs.cap_logarithm(offset / distance, sine, exponential)
+        return logarithms + wp.outer(wp.vec2(weight, weight * nearer), left)
+
+    return SimpleNamespace(add_sphere=add_sphere, both_logarithms=both_logarithms)
+
+
+@dataclass(frozen=True, eq=False)
+class SphereState:
+    """The sphere sets of a scene's bodies without a rigid shape.
+
+    sets: per deforming shape of the loose entity.
+    """
+
+    shapes: tuple[DeformingShape, ...]
+    sets: tuple[SphereSet, ...]
+    tables: wp.array  # (1): of SphereTable
+
+
+def upload_spheres(
+    shapes: tuple[DeformingShape, ...], sets: tuple[SphereSet, ...], entity: int, worlds: int, device: wp.Device
+) -> SphereState:
+    """Room for the nodes of the sphere sets of shapes, all of which belong to one entity."""
+    leaves = np.concatenate([np.zeros(0, np.int32), *(spheres.leaves for spheres in sets)])
+    table = SphereTable()
+    table.center = wp.zeros((worlds, len(leaves)), dtype=wp.vec3, device=device)
+    table.radius = wp.zeros((worlds, len(leaves)), dtype=wp.float32, device=device)
+    table.weight = wp.zeros((worlds, len(leaves)), dtype=wp.float32, device=device)
+    table.leaves = wp.array(leaves, dtype=wp.int32, device=device)
+    table.entity = wp.full(len(leaves), entity, dtype=wp.int32, device=device)
+    return SphereState(shapes, sets, upload_tables([table], SphereTable, device))
+
+
+def carry_spheres(state: SphereState, loose: Loose | None) -> None:
+    """Brings the spheres to where the present shape of the deforming bodies carries them.
+
+    A shape that is not shown, or no longer has the vertices that it was fitted with, has none.
+    """
+    if not state.sets:
+        return
+    nodes = []
+    for rest, spheres in zip(state.shapes, state.sets, strict=True):
+        shape = None if loose is None else loose.shape(rest.name, len(rest.vertices))
+        if shape is None:
+            hidden = np.zeros(len(spheres.leaves), np.float32)
+            nodes.append((np.zeros((len(hidden), 3), np.float32), hidden, hidden))
+        else:
+            nodes.append(place_nodes(spheres, spheres.carried(shape)))
+    (table,) = state.tables.tables
+    for array, parts in zip((table.center, table.radius, table.weight), zip(*nodes, strict=True), strict=True):
+        values = np.concatenate(parts)
+        array.assign(np.repeat(values[None], array.shape[0], axis=0))
+
+
+def make_cuts(worlds: int, receivers: int, has_spheres: bool, device: wp.Device) -> wp.array:
+    """Room for the cuts of so many receivers; none where there are no spheres."""
+    clusters = -(-receivers // CLUSTER) if has_spheres else 0
+    table = CutTable()
+    table.count = wp.zeros((worlds, clusters), dtype=wp.int32, device=device)
+    table.node = wp.zeros((worlds, clusters, MOST_IN_CUT), dtype=wp.int32, device=device)
+    return upload_tables([table], CutTable, device)
+
+
+def choose_cuts(cuts: wp.array, receivers: ReceiverTable, spheres: SphereState, device: wp.Device) -> None:
+    """Finds the cut of each cluster of receivers; once per frame and set of receivers."""
+    launch(_choose_cuts, cuts.tables[0].count.shape, [receivers, spheres.tables], [cuts], device)
