@@ -47,10 +47,10 @@ def settle(name: str):
     return model, deque(scene.states(model, 30, MOMENTS[name]), maxlen=1).pop()
 
 
-def render(model, data, environment: psf.Environment, order: int, shading: str, size: tuple[int, int]) -> dict:
+def render(model, data, environment: psf.Environment, size: tuple[int, int], **options) -> dict:
     """The layers of a frame in the environment's light alone, with the points that its pixels show."""
     with psf.Renderer(
-        model, size[1], size[0], environment=environment, order=order, bounces=0, shading=shading, model_lights=False
+        model, size[1], size[0], environment=environment, bounces=0, model_lights=False, **options
     ) as renderer:
         renderer.update_scene(data, camera="front")
         layers = renderer.layers()
@@ -86,11 +86,9 @@ def near_contact(model, data, points: np.ndarray, floor: int) -> np.ndarray:
     return near
 
 
-def compare(
-    model, data, environment: psf.Environment, order: int, shading: str, size: tuple[int, int], reference: dict
-) -> Comparison:
-    """Renders and compares; the reference's irradiance is kept in `reference` for the next call."""
-    layers = render(model, data, environment, order, shading, size)
+def compare(model, data, environment: psf.Environment, size: tuple[int, int], reference: dict, **options) -> Comparison:
+    """Renders with the renderer's options and compares; `reference` keeps the reference for the next call."""
+    layers = render(model, data, environment, size, **options)
     seen = layers["segmentation"][..., 0] >= 0
     points, normals = layers["points"][seen], layers["normal"][seen]
     if "irradiance" not in reference:
@@ -129,6 +127,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(MOMENTS))
     parser.add_argument("--orders", nargs="+", type=int, default=[4, 6])
     parser.add_argument("--shading", default="pixel", choices=["pixel", "vertex"])
+    parser.add_argument("--compose", default="product", choices=["product", "log"])
     parser.add_argument("--environment", default="studio")
     parser.add_argument("--size", nargs=2, type=int, default=[320, 180], metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--pictures", type=Path, help="folder for rendered, reference and difference")
@@ -143,7 +142,8 @@ def main() -> None:
         model, data = settle(name)
         reference: dict = {}
         for order in options.orders:
-            found = compare(model, data, environment, order, options.shading, tuple(options.size), reference)
+            how = {"order": order, "shading": options.shading, "compose": options.compose}
+            found = compare(model, data, environment, tuple(options.size), reference, **how)
             figures = (found.whole, found.floor, found.contact, found.maximum)
             print(f"{name:10} {order:5} " + " ".join(f"{figure:8.4f}" for figure in figures), flush=True)
             rows.append(

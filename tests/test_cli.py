@@ -35,14 +35,52 @@ def test_render_writes_every_frame_and_what_is_made_of_them(renderers, model_pat
 
 
 def test_options_reach_the_renderer(renderers, model_path, tmp_path):
-    flags = ("--environment", "none", "--order", 5, "--shading", "vertex", "--exposure", "-1.5", "--view", "srgb")
-    rest = ("--device", "cpu", "--no-model-lights", "--formats", "png", "--frames", "1:3", "--bounces", 0)
+    flags = (
+        "--environment",
+        "none",
+        "--order",
+        5,
+        "--compose",
+        "log",
+        "--shading",
+        "vertex",
+        "--exposure",
+        "-1.5",
+        "--view",
+        "srgb",
+    )
+    rest = (
+        "--device",
+        "cpu",
+        "--compose",
+        "log",
+        "--no-model-lights",
+        "--formats",
+        "png",
+        "--frames",
+        "1:3",
+        "--bounces",
+        0,
+    )
     result = run("render", model_path, "--out", tmp_path / "out", *SMALL, *flags, *rest)
     assert result.exit_code == 0, result.output
     (renderer,) = renderers
     assert (renderer.width, renderer.height, renderer.pictures) == (32, 18, 2)
-    expected = {"environment": None, "order": 5, "shading": "vertex", "exposure": -1.5, "view": "srgb"}
-    assert renderer.options == expected | {"device": "cpu", "model_lights": False, "lights": (), "bounces": 0}
+    expected = {
+        "environment": None,
+        "order": 5,
+        "compose": "log",
+        "shading": "vertex",
+        "exposure": -1.5,
+        "view": "srgb",
+    }
+    assert renderer.options == expected | {
+        "device": "cpu",
+        "compose": "log",
+        "model_lights": False,
+        "lights": (),
+        "bounces": 0,
+    }
     assert {"frame_0001.png", "frame_0002.png"} < set(files_of(tmp_path / "out"))
 
 

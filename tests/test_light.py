@@ -9,7 +9,7 @@ import pytest
 from warp_psf.basis import sh, sphere
 from warp_psf.scene import environment, light, primitives
 from warp_psf.scene.environment import BUILT_IN, Environment, load_environment
-from warp_psf.scene.light import AreaLight, DeltaLight, rectangle_light
+from warp_psf.scene.light import AreaLight, DeltaLight, rectangle_light, sphere_light
 
 BLACK = np.zeros(3)
 
@@ -268,6 +268,16 @@ def test_rectangle_light_straight_down_and_by_rotation():
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_array_equal(rectangle_light("lamp", 1, 1, [1, 1, 1], [0, 0, 1], rotation=turn).rotation, turn)
     np.testing.assert_array_equal(rectangle_light("lamp", 1, 1, [1, 1, 1], [0, 0, 1]).rotation, np.eye(3))
+
+
+def test_a_sphere_light_is_a_sphere_about_its_position():
+    lamp = sphere_light("lamp", 0.3, [1.0, 2.0, 3.0], [0.0, 1.0, 2.0], body="arm")
+    assert lamp.mesh.sphere == pytest.approx(0.3)
+    np.testing.assert_array_equal(lamp.position, [0.0, 1.0, 2.0])
+    assert lamp.body == "arm"
+    for radius in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match=f"light 'lamp': radius is {radius}; give a positive number of metres"):
+            sphere_light("lamp", radius, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(

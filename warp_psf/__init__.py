@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from warp_psf.film.writer import image_difference, read_exr
     from warp_psf.renderer import Renderer
     from warp_psf.scene.environment import Environment, load_environment
-    from warp_psf.scene.light import AreaLight, DeltaLight, rectangle_light
+    from warp_psf.scene.light import AreaLight, DeltaLight, rectangle_light, sphere_light
     from warp_psf.scene.mesh import Mesh, load_mesh, make_mesh
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "make_mesh",
     "read_exr",
     "rectangle_light",
+    "sphere_light",
     "to_display",
 ]
 
@@ -47,6 +48,7 @@ _HOMES = {
     "make_mesh": "scene.mesh",
     "read_exr": "film.writer",
     "rectangle_light": "scene.light",
+    "sphere_light": "scene.light",
     "to_display": "film.display",
 }
 

@@ -71,7 +71,7 @@ def render_frames(
     chosen_camera = _find_camera(model, options.camera or camera or "-1")
     if options.environment is not None:
         environment = None if options.environment == NO_ENVIRONMENT else options.environment
-    shared = ("order", "bounces", "shading", "model_lights", "exposure", "view")
+    shared = ("order", "compose", "bounces", "shading", "model_lights", "exposure", "view")
     same = {option: getattr(options, option) for option in shared}
     # What a frame's pixels depend on. The device is not among it: a run may move to another machine.
     settings = same | dict(motion or {})

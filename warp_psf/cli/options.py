@@ -54,6 +54,9 @@ class Options:
     ] = None
     model_lights: Annotated[bool, option(LIGHT, "Use the lights that the model brings.")] = True
     order: Annotated[int, option(LIGHT, "Bands of spherical harmonics.", min=2, max=6)] = 4
+    compose: Annotated[
+        str, option(LIGHT, "How bodies' shadows combine: product, or log, which adds logarithms.", "product|log")
+    ] = "product"
     bounces: Annotated[int, option(LIGHT, "Bounces between bodies; 0 is none.", "N", min=0, max=16)] = 3
     shading: Annotated[str, option(LIGHT, "Where light is computed.", "pixel|vertex")] = "pixel"
     device: Annotated[str | None, option(None, "cpu, cuda:0, ...; default: the first GPU.", "D")] = None

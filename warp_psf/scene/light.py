@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from warp_psf.scene.mesh import Mesh
-from warp_psf.scene.primitives import plane
+from warp_psf.scene.primitives import plane, sphere
 
 if TYPE_CHECKING:
     from warp_psf.scene.scene import Scene
@@ -155,6 +155,23 @@ def rectangle_light(
     elif rotation is None:
         rotation = np.eye(3)
     return AreaLight(name, plane(width / 2.0, height / 2.0, cells=1), radiance, position, rotation, body)
+
+
+def sphere_light(name: str, radius: float, radiance, position, *, body: str | None = None) -> AreaLight:
+    """A sphere that shines to all sides.
+
+    Args:
+        radius: metres.
+        radiance: linear Rec.709, 3 values.
+        position: of its centre in the parent's frame, metres, [3].
+        body: the parent, as in `AreaLight`.
+
+    Raises:
+        ValueError: the radius is not positive, or a value is not usable.
+    """
+    if not SHORTEST_LENGTH < radius < np.inf:
+        raise ValueError(f"light {name!r}: radius is {radius}; give a positive number of metres")
+    return AreaLight(name, sphere(radius), radiance, position, body=body)
 
 
 def check_lights(lights: Sequence[Light], model_count: int) -> None:
