@@ -1,26 +1,30 @@
-"""A figure with one smooth skin walks on the spot: a body without a rigid shape. `python -m sims.figure`."""
+"""A figure with one smooth skin dances on the spot: a body without a rigid shape. `python -m sims.figure`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from sims import HIDDEN_GROUP, add_material, add_mesh, draw_box, draw_mesh, frame_numbers, new_stage
-from sims.bodies import ball, pedestal
+from sims.bodies import ball, rounded_box
 from sims.surfaces import Body, implicit_surface
+
+if TYPE_CHECKING:
+    import warp_psf as psf
 
 # Metres. The figure is as tall as it says, and faces -y.
 HEIGHT = 1.7
 # Edge of the grid cubes of its skin, and over what length its limbs blend: shares of the height.
-CELL, BLEND = 0.0188, 0.03
-# Seconds of two steps: the motion repeats from there.
-PERIOD = 1.6
+CELL, BLEND = 0.01855, 0.03
+# Seconds in which each foot and each arm is lifted once: the motion repeats from there.
+PERIOD = 4.0
 # A vertex follows up to so many bones, by the inverse of this power of its distance to them.
-BONES_PER_VERTEX, FOLLOWING = 4, 5
+BONES_PER_VERTEX, FOLLOWING = 4, 4
 CLEARANCE = 0.01  # of the lower foot above the floor, metres
 
 
@@ -39,51 +43,46 @@ class Bone:
 
 
 def _limbs(name: str, side: float) -> dict[str, Bone]:
+    # At rest arms are half lifted and legs apart: what is bound midway between its extremes bends least.
+    shoulder, elbow, wrist, tip = (
+        (0.105 * side, 0.0, 0.8),
+        (0.205 * side, 0.008, 0.7),
+        (0.293 * side, -0.012, 0.61),
+        (0.338 * side, -0.024, 0.56),
+    )
+    hip, knee, ankle = (0.062 * side, 0.0, 0.53), (0.078 * side, -0.008, 0.3), (0.085 * side, 0.004, 0.062)
+    heel, toe = (0.085 * side, 0.01, 0.038), (0.1 * side, -0.088, 0.028)
     return {
-        f"upper arm {name}": Bone("chest", (0.115 * side, 0, 0.795), (0.19 * side, 0.01, 0.66), (0.042, 0.033)),
-        f"forearm {name}": Bone(
-            f"upper arm {name}", (0.19 * side, 0.01, 0.66), (0.22 * side, -0.03, 0.52), (0.033, 0.026)
-        ),
-        f"hand {name}": Bone(
-            f"forearm {name}", (0.22 * side, -0.03, 0.52), (0.225 * side, -0.045, 0.46), (0.026, 0.024)
-        ),
-        f"thigh {name}": Bone("pelvis", (0.055 * side, 0, 0.54), (0.062 * side, -0.005, 0.31), (0.066, 0.046)),
-        f"shin {name}": Bone(f"thigh {name}", (0.062 * side, -0.005, 0.31), (0.064 * side, 0.01, 0.075), (0.046, 0.03)),
-        f"foot {name}": Bone(f"shin {name}", (0.064 * side, 0.012, 0.04), (0.072 * side, -0.08, 0.03), (0.035, 0.026)),
+        f"upper arm {name}": Bone("chest", shoulder, elbow, (0.043, 0.032), (0.0, -side, 0.0)),
+        f"forearm {name}": Bone(f"upper arm {name}", elbow, wrist, (0.032, 0.023), (0.0, -side, 0.0)),
+        f"hand {name}": Bone(f"forearm {name}", wrist, tip, (0.023, 0.026), (0.0, -side, 0.0)),
+        f"thigh {name}": Bone("pelvis", hip, knee, (0.064, 0.044)),
+        f"shin {name}": Bone(f"thigh {name}", knee, ankle, (0.044, 0.029)),
+        f"foot {name}": Bone(f"shin {name}", heel, toe, (0.036, 0.026)),
     }
 
 
 BONES = {
-    "pelvis": Bone("", (0, 0, 0.55), (0, 0.005, 0.63), (0.085, 0.072)),
-    "chest": Bone("pelvis", (0, 0.005, 0.63), (0, 0.0, 0.77), (0.072, 0.098), axis=(0.0, 0.0, 1.0)),
-    "head": Bone("chest", (0, 0.0, 0.84), (0, -0.008, 0.935), (0.034, 0.06)),
+    "pelvis": Bone("", (0, 0, 0.56), (0, 0.004, 0.63), (0.084, 0.072)),
+    "chest": Bone("pelvis", (0, 0.004, 0.63), (0, 0.0, 0.765), (0.07, 0.093), axis=(0.0, 0.0, 1.0)),
+    "head": Bone("chest", (0, 0.004, 0.86), (0, -0.012, 0.932), (0.036, 0.066), axis=(0.0, 0.0, 1.0)),
     **_limbs("left", 1.0),
     **_limbs("right", -1.0),
-}
-# Of each hinge: mean, and amplitude and phase (turns) of its swing; radians. The right side is half a period behind.
-SWINGS = {
-    "chest": (0.0, 0.12, 0.25),
-    "head": (0.08, 0.04, 0.5),
-    "upper arm": (0.1, 0.55, 0.5),
-    "forearm": (-0.55, 0.3, 0.5),
-    "thigh": (-0.12, 0.5, 0.0),
-    "shin": (0.5, 0.5, 0.27),
-    "foot": (-0.1, 0.2, 0.1),
 }
 
 
 def build() -> mujoco.MjModel:
-    """The figure between a ball and a pedestal, on a floor."""
-    spec = new_stage(position=(1.6, -3.6, 1.5), target=(0.0, 0.0, 0.78), fovy=34)
+    """The figure between a ball and a block, on a floor."""
+    spec = new_stage(position=(1.5, -4.3, 1.35), target=(0.0, 0.0, 0.86), fovy=29)
     add_material(spec, "floor", (0.8, 0.78, 0.74))
-    add_material(spec, "skin", (0.78, 0.5, 0.36), gloss=0.1)
-    add_material(spec, "blue", (0.25, 0.38, 0.6), gloss=0.2)
-    add_material(spec, "stone", (0.62, 0.6, 0.57))
-    draw_box(spec.worldbody, "floor", (-12.0, -6.0, -0.1), (12.0, 30.0, 0.0), "floor")
+    add_material(spec, "skin", (0.8, 0.56, 0.43), gloss=0.1)
+    add_material(spec, "ball", (0.22, 0.4, 0.5), gloss=0.2)
+    add_material(spec, "block", (0.86, 0.76, 0.5))
+    draw_box(spec.worldbody, "floor", (-30.0, -8.0, -0.1), (30.0, 54.0, 0.0), "floor")
     add_mesh(spec, "ball", ball(cells=24, diameter=0.36))
-    draw_mesh(spec.worldbody.add_body(pos=(-0.62, -0.45, 0.18)), "ball", "blue")
-    add_mesh(spec, "pedestal", pedestal(0.2, 0.5))
-    draw_mesh(spec.worldbody.add_body(pos=(0.75, 0.3, 0.0)), "pedestal", "stone")
+    draw_mesh(spec.worldbody.add_body(pos=(-0.66, -0.3, 0.18)), "ball", "ball")
+    add_mesh(spec, "block", rounded_box((0.2, 0.16, 0.22), 0.025, cells=16))
+    draw_mesh(spec.worldbody.add_body(pos=(0.78, 0.3, 0.22), quat=(0.97, 0.0, 0.0, 0.24)), "block", "block")
     bodies: dict[str, mujoco.MjsBody] = {}
     for name, bone in BONES.items():
         above = bodies.get(bone.parent, spec.worldbody)
@@ -110,19 +109,27 @@ def states(model: mujoco.MjModel, frames_per_second: float = 30, duration: float
     data = mujoco.MjData(model)
     for frame in frame_numbers(frames_per_second, duration):
         data.time = frame / frames_per_second
-        for name in BONES:
-            limb, _, side = name.rpartition(" ")
-            mean, swing, phase = SWINGS.get(limb or side, (0.0, 0.0, 0.0))
-            turns = data.time / PERIOD + phase + (0.5 if side == "right" else 0.0)
-            if BONES[name].parent:
-                data.joint(name).qpos[0] = mean + swing * math.sin(2 * math.pi * turns)
+        for name, angle in _pose(data.time / PERIOD).items():
+            data.joint(name).qpos[0] = angle
         _stand(model, data)
         yield data
 
 
+def lights() -> tuple:
+    """None: the studio is light enough."""
+    return ()
+
+
+def environment() -> psf.Environment:
+    """A studio, whose lamps are large."""
+    import warp_psf as psf
+
+    return psf.load_environment("studio")
+
+
 def skin() -> Body:
     """The figure's surface at rest, metres."""
-    low, high = np.array([-0.3, -0.2, -0.05]), np.array([0.3, 0.15, 1.05])
+    low, high = np.array([-0.43, -0.2, -0.05]), np.array([0.43, 0.15, 1.05])
     vertices, faces = implicit_surface(_distance, low, high, CELL)
     return vertices * HEIGHT, faces
 
@@ -170,6 +177,26 @@ def _add_skin(spec: mujoco.MjSpec) -> None:
     )
 
 
+def _pose(turns: float) -> dict[str, float]:
+    """The angle of every hinge, radians, after a share of the period. The right side is half a period behind."""
+    angles = {"chest": 0.16 * _wave(turns, 0.25), "head": -0.22 * _wave(turns, 0.2)}
+    for side, behind in (("left", 0.0), ("right", 0.5)):
+        # Thigh and shin are about equally long: bent so, they lift the foot straight up, and it stays level.
+        lift = 0.3 + 0.12 * _wave(2 * turns, 0.0) + 0.75 * max(_wave(turns, behind), 0.0) ** 2
+        arm = _wave(turns, behind + 0.4)
+        angles |= {f"thigh {side}": -lift, f"shin {side}": 2 * lift, f"foot {side}": -lift}
+        angles |= {
+            f"upper arm {side}": 0.1 + 0.42 * arm,
+            f"forearm {side}": 0.4 + 0.35 * arm,
+            f"hand {side}": 0.1 + 0.2 * arm,
+        }
+    return angles
+
+
+def _wave(turns: float, phase: float) -> float:
+    return math.sin(2 * math.pi * (turns - phase))
+
+
 def _stand(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Lifts the figure until its lower foot stands on the floor."""
     data.joint("lift").qpos[0] = 0.0
@@ -187,4 +214,4 @@ def _stand(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 if __name__ == "__main__":
     from warp_psf.cli import run_simulation
 
-    run_simulation(build, states, name="figure", camera="front", environment="studio")
+    run_simulation(build, states, name="figure", camera="front", environment=environment(), lights=lights())

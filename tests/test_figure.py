@@ -11,7 +11,7 @@ import pytest
 
 from sims import HIDDEN_GROUP, figure
 
-# Divides the periods of a walk or a dance into whole frames, so that the motion can be compared after one.
+# One period is a whole number of frames, so that the motion can be compared after it.
 FRAMES_PER_SECOND = 10
 
 
@@ -62,6 +62,8 @@ def test_the_skin_is_closed_and_faces_outward(model):
 
 
 def test_every_vertex_follows_up_to_four_bones_with_weights_that_sum_to_one(model):
+    # MuJoCo normalises what it is given, so what it is given is looked at too.
+    np.testing.assert_allclose(figure.follow()[1].sum(axis=1), 1.0, atol=1e-12)
     total = np.bincount(model.skin_bonevertid, model.skin_bonevertweight, model.nskinvert)
     # Float32 of four weights.
     np.testing.assert_allclose(total, 1.0, atol=1e-6)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import warp_psf as psf
+from benchmarks.accuracy import pixel_points
 from sims import figure
 from tests.oracles import loose_triangles, shade_points, traced_irradiance
 from warp_psf.bake.sphere_set import share_rays
@@ -151,6 +152,42 @@ def test_a_skins_shadow_agrees_with_ray_casting(walking):
     # The issue's bar for a skinned body is 0.04 of unshadowed irradiance on the ground it stands on.
     assert np.sqrt(np.mean(error**2)) < 0.03
     assert ((clear - expected) / clear.max()).max() > 0.5  # there is a shadow to be wrong about
+
+
+def test_under_a_point_light_deforming_bodies_cast_shadows_and_tendons_do_not():
+    # A light above the middle of a square of cloth, which lies level over the floor beside a thick tendon.
+    xml = """
+<mujoco>
+  <visual><headlight active="0"/></visual>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <light pos="0 0 3" dir="0 0 -1" diffuse="1 1 1" cutoff="90" exponent="0" bulbradius="0"/>
+    <site name="a" pos="-1 1.5 .5"/><site name="b" pos="1 1.5 .5"/>
+    <flexcomp name="cloth" type="grid" count="5 5 1" spacing=".2 .2 .2" pos="0 0 1" radius=".01" dim="2" mass="1"/>
+  </worldbody>
+  <tendon><spatial width=".2"><site site="a"/><site site="b"/></spatial></tendon>
+</mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.vis.quality.offsamples = 0  # at the cloth's edge a pixel would show some of it
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    # From below the cloth the floor is seen; the camera looks straight down from under it.
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.0, 1.0, 0.0), 6.0, 90.0, -89.9
+    with psf.Renderer(model, 96, 96, environment=None, bounces=0) as renderer:
+        renderer.update_scene(data, camera)
+        layers = renderer.layers()
+        points = pixel_points(layers["depth"], renderer.world_from_camera, np.deg2rad(model.vis.global_.fovy))
+    floor = (layers["segmentation"] == (model.geom("floor").id, int(mujoco.mjtObj.mjOBJ_GEOM))).all(axis=-1)
+    lit = layers["direct"][..., 0]
+    # The cloth is 0.8 m wide at a height of 1 m; its shadow from 3 m is half as wide again.
+    x, y = points[..., 0], points[..., 1]
+    under = floor & (np.maximum(abs(x), abs(y)) < 0.55) & (np.maximum(abs(x), abs(y)) > 0.45)
+    beside = floor & (np.maximum(abs(x), abs(y)) > 0.65)
+    assert under.any() and (lit[under] == 0.0).all()
+    # The tendon's shadow would lie at y = 1.8.
+    assert (beside & (abs(y - 1.8) < 0.05) & (abs(x) < 0.8)).any()
+    assert (lit[beside & (np.hypot(x, y) < 2.0)] > 0.0).all()
 
 
 def test_a_skin_that_is_not_shown_casts_no_shadow(walking):

@@ -26,11 +26,9 @@ from warp_psf.field.radiance import FUNCTION_COUNTS
 from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
 from warp_psf.film.resolve import read_layers
 from warp_psf.scene.environment import Environment, load_environment
-from warp_psf.scene.geometry import write_loose
 from warp_psf.scene.light import Light
 from warp_psf.scene.loose import LooseRoom, make_room
-from warp_psf.shade.spheres import carry_spheres
-from warp_psf.stage import Progress, Settings, Stage, draw, place, set_stage, take_over
+from warp_psf.stage import Progress, Settings, Stage, draw, place, place_loose, set_stage, take_over
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
@@ -331,8 +329,7 @@ class Renderer:
             stage = self._stage
             take_over(stage, standing)
         if stage.room is not None:
-            write_loose(stage.device_scene, stage.scene, loose)
-            carry_spheres(stage.spheres, loose)
+            place_loose(stage, loose)
         return stage
 
     def _first_room(self) -> LooseRoom | None:

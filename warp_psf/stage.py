@@ -19,13 +19,19 @@ from warp_psf.film.tracing import any_seen_from_behind
 from warp_psf.scene.camera import Camera
 from warp_psf.scene.detail import refine_flat_bodies
 from warp_psf.scene.environment import Environment
-from warp_psf.scene.geometry import DeviceScene, upload_scene, write_poses
+from warp_psf.scene.geometry import DeviceScene, upload_scene, write_loose, write_poses
 from warp_psf.scene.light import DeltaLight, area_light_entities
-from warp_psf.scene.loose import LooseRoom
+from warp_psf.scene.loose import Loose, LooseRoom
 from warp_psf.scene.scene import Poses, Scene
 from warp_psf.scene.tint import TextureTable, upload_textures
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
-from warp_psf.shade.delta import DeltaState, add_delta_lights, make_delta_lights, write_delta_lights
+from warp_psf.shade.delta import (
+    DeltaState,
+    add_delta_lights,
+    make_delta_lights,
+    write_delta_lights,
+    write_loose_opacity,
+)
 from warp_psf.shade.direct import DirectState, shade_direct, upload_lighting, write_environment
 from warp_psf.shade.gloss import shade_gloss
 from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
@@ -33,7 +39,7 @@ from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice
 from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
-from warp_psf.shade.spheres import SphereState, choose_cuts, make_cuts, upload_spheres
+from warp_psf.shade.spheres import SphereState, carry_spheres, choose_cuts, make_cuts, upload_spheres
 from warp_psf.shade.tint import tint_proxies
 
 Progress = Callable[[str, float], None]
@@ -199,6 +205,13 @@ def place(stage: Stage, poses: Poses, view: Camera, lights: tuple[DeltaLight, ..
     write_delta_lights(stage.delta_lights, [lights])
 
 
+def place_loose(stage: Stage, loose: Loose | None) -> None:
+    """Brings what has no rigid shape to the device; the stage has a room that holds it."""
+    write_loose(stage.device_scene, stage.scene, loose)
+    carry_spheres(stage.spheres, loose)
+    write_loose_opacity(stage.delta_lights, stage.scene.loose, loose is not None and bool(loose.deforming.any()))
+
+
 def take_over(stage: Stage, before: Stage) -> None:
     """Shows on a new stage the state that an older one of the same model shows, whose loose entity lacked room."""
     poses = before.poses
@@ -223,8 +236,8 @@ def draw(stage: Stage) -> None:
     else:
         _shade_vertices(stage, stage.vertices, stage.vertices_received)
     with _timed(stage, "shadow rays"):
-        opacity, eye = stage.occlusion.table.occluders.opacity, stage.lighting.table.eye
-        add_delta_lights(surfaces.receivers, scene, opacity, eye, stage.delta_lights, *stage.received, device)
+        eye = stage.lighting.table.eye
+        add_delta_lights(surfaces.receivers, scene, eye, stage.delta_lights, *stage.received, device)
     if stage.bounces is not None and stage.last_gather is not None:
         _bounce(stage, stage.bounces, stage.last_gather)
     with _timed(stage, "resolve pixels"):
@@ -270,8 +283,8 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         choose_cuts(cuts, bounces.proxies, stage.spheres, device)
         shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, cuts, *received, device)
         shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, cuts, stage.delta_lights, received[0], device)
-        opacity, eye = stage.occlusion.table.occluders.opacity, stage.lighting.table.eye
-        add_delta_lights(bounces.proxies, scene, opacity, eye, stage.delta_lights, *bounces.received, device)
+        eye = stage.lighting.table.eye
+        add_delta_lights(bounces.proxies, scene, eye, stage.delta_lights, *bounces.received, device)
     with _timed(stage, "bounces"):
         bounce(bounces, scene, stage.occlusion, settings.bounces, device)
     with _timed(stage, "last gather"):

@@ -292,12 +292,17 @@ def _height_polynomials(m: int, order: int) -> list[np.ndarray]:
 
 def _rotate_snippet(order: int) -> str:
     """C++ for the product of a vector with a rotation's rows, band by band: other entries of the rows are zero."""
-    lines = [f"wp::vec_t<{order * order}, float> turned;"]
+    lines = [f"float turned[{order * order}];", f"for (int j = 0; j < {order * order}; ++j) turned[j] = 0.0f;"]
     for band in range(order):
-        block = range(band * band, (band + 1) ** 2)
-        lines += [f"const auto& row{k} = wp::index(rows, {k});" for k in block]
-        lines += [f"turned[{j}] = {' + '.join(f'v[{k}] * row{k}[{j}]' for k in block)};" for j in block]
-    return "\n".join([*lines, "return turned;"])
+        # The numbers of a band lie side by side, as a compiler wants them.
+        first, end = band * band, (band + 1) ** 2
+        lines += [
+            f"for (int k = {first}; k < {end}; ++k) {{ const float share = v[k]; const auto& row = wp::index(rows, k);"
+        ]
+        lines += [f"for (int j = {first}; j < {end}; ++j) turned[j] += share * row[j]; }}"]
+    lines += [f"wp::vec_t<{order * order}, float> result;"]
+    lines += [f"for (int j = 0; j < {order * order}; ++j) result[j] = turned[j];"]
+    return "\n".join([*lines, "return result;"])
 
 
 def _literal(value: float) -> str:

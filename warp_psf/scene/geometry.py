@@ -27,6 +27,7 @@ class GeometryTable:
     lower: wp.array(dtype=wp.vec3)  # (entity): corners of the bounding box, in the entity's frame
     upper: wp.array(dtype=wp.vec3)  # (entity)
     convex: wp.array(dtype=wp.bool)  # (entity)
+    shadow_group: wp.array(dtype=wp.int32)  # (entity): the group of its mesh's faces that stop rays, -1: all do
     opacity: wp.array(dtype=wp.float32)  # (entity), in (0, 1]
     specular: wp.array(dtype=wp.vec3)  # (entity)
     exponent: wp.array(dtype=wp.float32)  # (entity)
@@ -47,6 +48,8 @@ class PoseTable:
     rotation: wp.array2d(dtype=wp.mat33)  # (world, entity), world_from_entity
 
 
+# The group of a loose entity's faces that cast shadows: those of deforming bodies, and not those of mere marks.
+CASTING = 0
 # What kernels and device functions take: arrays of one table (see `device.upload_tables`).
 GeometryTables = wp.array(dtype=GeometryTable)
 PoseTables = wp.array(dtype=PoseTable)
@@ -111,6 +114,8 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     table.radius = per_entity([mesh.radius for mesh in shapes], wp.float32)
     table.lower = per_entity([wp.vec3(*map(float, mesh.vertices.min(axis=0))) for mesh in shapes], wp.vec3)
     table.upper = per_entity([wp.vec3(*map(float, mesh.vertices.max(axis=0))) for mesh in shapes], wp.vec3)
+    shadow_group = [CASTING if index == scene.loose else -1 for index in range(len(shapes))]
+    table.shadow_group = per_entity(shadow_group, wp.int32)
     table.convex = per_entity([mesh.convex for mesh in shapes], wp.bool)
     table.opacity = per_entity([entity.opacity for entity in scene.entities], wp.float32)
     table.specular = per_entity([wp.vec3(*map(float, lobe.specular)) for lobe in lobes], wp.vec3)
@@ -171,7 +176,9 @@ def write_loose(device_scene: DeviceScene, scene: Scene, loose: Loose | None) ->
         _write(table.object_type, first_part, np.array([part.object_type for part in loose.parts], np.int32))
         points = wp.array(loose.vertices, dtype=wp.vec3, device=device)
         indices = wp.array(loose.faces.reshape(-1), dtype=wp.int32, device=device)
-        device_scene.meshes[mesh] = wp.Mesh(points=points, indices=indices)
+        casting = np.where(loose.deforming[loose.face_part], CASTING, CASTING + 1)
+        groups = wp.array(casting, dtype=wp.int32, device=device)
+        device_scene.meshes[mesh] = wp.Mesh(points=points, indices=indices, groups=groups)
         _write(table.mesh_id, mesh, np.array([device_scene.meshes[mesh].id], np.uint64))
     _write(table.lower, entity, lower[None].astype(np.float32))
     _write(table.upper, entity, upper[None].astype(np.float32))

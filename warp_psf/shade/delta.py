@@ -121,7 +121,11 @@ def share_passed(
                 start = inverse * (p - position)
                 way = inverse * toward
                 if may_hit(geometry, entity, start, way, 1.0):
-                    if wp.mesh_query_ray_anyhit(geometry[0].mesh_id[geometry[0].entity_mesh[entity]], start, way, 1.0):
+                    mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
+                    root = int(-1)
+                    if geometry[0].shadow_group[entity] >= 0:
+                        root = wp.mesh_get_group_root(mesh, geometry[0].shadow_group[entity])
+                    if wp.mesh_query_ray_anyhit(mesh, start, way, 1.0, root):
                         passed *= 1.0 - opacity[entity]
                         if passed <= 0.0:
                             return 0.0
@@ -250,6 +254,7 @@ class DeltaState:
 
     table: DeltaLightTable
     far: float  # metres: how far a directional light's shadow rays reach
+    opacity: wp.array  # (entity): share of light that each stops, 0 for what casts no shadow
 
 
 def make_delta_lights(scene: Scene, worlds: int, far: float, device: wp.Device) -> DeltaState:
@@ -266,7 +271,13 @@ def make_delta_lights(scene: Scene, worlds: int, far: float, device: wp.Device) 
     table.reach = wp.zeros(shape, dtype=wp.float32, device=device)
     table.radius = wp.zeros(shape, dtype=wp.float32, device=device)
     table.casts = wp.zeros(shape, dtype=wp.bool, device=device)
-    return DeltaState(table, far)
+    opacity = [entity.opacity if entity.casts else 0.0 for entity in scene.entities]
+    return DeltaState(table, far, wp.array(opacity, dtype=wp.float32, device=device))
+
+
+def write_loose_opacity(state: DeltaState, entity: int, casts: bool) -> None:
+    """Whether the loose entity casts shadows in this frame: it does when it has a deforming body."""
+    state.opacity[entity : entity + 1].fill_(1.0 if casts else 0.0)
 
 
 def write_delta_lights(state: DeltaState, worlds: Sequence[Sequence[DeltaLight]]) -> None:
@@ -295,7 +306,6 @@ def write_delta_lights(state: DeltaState, worlds: Sequence[Sequence[DeltaLight]]
 def add_delta_lights(
     receivers: ReceiverTable,
     scene: DeviceScene,
-    opacity: wp.array,
     eye: wp.array,
     lights: DeltaState,
     diffuse: wp.array,
@@ -305,5 +315,5 @@ def add_delta_lights(
     """Adds the delta lights to the receivers' irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, slot)."""
     if lights.table.kind.shape[1] == 0:
         return
-    inputs = [receivers, scene.geometry, scene.poses, opacity, eye, lights.table, lights.far]
+    inputs = [receivers, scene.geometry, scene.poses, lights.opacity, eye, lights.table, lights.far]
     launch(_add_delta_lights, diffuse.shape, inputs, [diffuse, glossy], device)

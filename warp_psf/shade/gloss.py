@@ -331,6 +331,5 @@ def shade_gloss(
     inputs = [proxies, scene.geometry, scene.poses, occlusion.tables, lighting.tables, cuts, state.table]
     launch(kit.shade_moments, shape, inputs, [irradiance], device)
     if delta.table.kind.shape[1] > 0:
-        opacity = occlusion.table.occluders.opacity
-        inputs = [proxies, scene.geometry, scene.poses, opacity, delta.table, delta.far, state.table]
+        inputs = [proxies, scene.geometry, scene.poses, delta.opacity, delta.table, delta.far, state.table]
         launch(kit.add_delta_moments, shape, inputs, [], device)
