@@ -92,7 +92,17 @@ def print_table(setting: str, plane: oracles_log.Plane, environment: np.ndarray,
         print(f"{method:6}{cells} {squares:9} {products:9} {len(visible) / seconds:13,.0f}", flush=True)
         rows.append({"method": method, "vector": errors[0], "shaded": errors[1], "squares": squares})
         rows[-1] |= {"products": products, "receivers_per_second": len(visible) / seconds}
-    return rows
+    best = relative(best_line(logarithms, expected), expected)
+    print(f"the best that any a 1 + b f does, chosen anew for each receiver: {best:.6f}", flush=True)
+    return [*rows, {"method": "best line", "vector": best}]
+
+
+def best_line(f: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Of every receiver the combination of 1 and f [R, n*n] that is nearest to what is expected."""
+    first = expected[:, 0] - f[:, 0] * (f[:, 1:] * expected[:, 1:]).sum(axis=1) / (f[:, 1:] ** 2).sum(axis=1)
+    found = f * ((f[:, 1:] * expected[:, 1:]).sum(axis=1) / (f[:, 1:] ** 2).sum(axis=1))[:, None]
+    found[:, 0] += first
+    return found
 
 
 def print_angles(center: np.ndarray, radius: np.ndarray, size: float) -> list[dict]:

@@ -1,6 +1,6 @@
-"""Simulations to render: bowling, falling, statues, room, teapots; `python -m sims.bowling` simulates and renders one.
+"""Simulations to render: bowling, falling, statues, room, teapots, figure; `python -m sims.bowling` renders one.
 
-Each of the five modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
+Each of these modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
 `lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the
 geoms that do are in group 3, which is not drawn.
 """
