@@ -55,6 +55,26 @@ GeometryTables = wp.array(dtype=GeometryTable)
 PoseTables = wp.array(dtype=PoseTable)
 
 
+@wp.struct
+class Placed:
+    """Where an entity is in a frame."""
+
+    position: wp.vec3  # of its frame, in the world, metres
+    rotation: wp.mat33  # world_from_entity
+    center: wp.vec3  # of its bounding sphere, in the world
+    radius: wp.float32  # of that, metres
+
+
+@wp.func
+def find_placed(world: int, entity: int, geometry: GeometryTables, poses: PoseTables) -> Placed:
+    placed = Placed()
+    placed.position = poses[0].position[world, entity]
+    placed.rotation = poses[0].rotation[world, entity]
+    placed.center = placed.position + placed.rotation * geometry[0].center[entity]
+    placed.radius = geometry[0].radius[entity]
+    return placed
+
+
 @wp.func
 def may_hit(geometry: GeometryTables, entity: int, origin: wp.vec3, direction: wp.vec3, farthest: float) -> bool:
     """Whether a ray in the entity's frame meets its bounding box before `farthest`, in units of `direction`."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_psf.basis import sh
 from warp_psf.basis.directions import sum_in_lanes
-from warp_psf.scene.geometry import GeometryTables, PoseTables
+from warp_psf.scene.geometry import GeometryTables, PoseTables, find_placed
 from warp_psf.shade.area import make_area
 from warp_psf.shade.direct import legendre_series
 from warp_psf.shade.occlude import make_occlude
@@ -103,9 +103,8 @@ def make_between(order: int) -> SimpleNamespace:
         o: OcclusionTables,
     ) -> float:
         """How far a body matters to a receiver: those that take up less of its view than `threshold` do not."""
-        rotation = poses[0].rotation[world, entity]
-        center = poses[0].position[world, entity] + rotation * geometry[0].center[entity]
-        weight = kit.matters(entity, own, p, n, center, geometry[0].radius[entity], rotation, o)
+        placed = find_placed(world, entity, geometry, poses)
+        weight = kit.matters(entity, own, p, n, placed, o)
         if weight > 0.0 and patches[0].first_face[entity] < 0:
             share = share_of(world, entity, p, geometry, poses, patches)
             weight *= wp.clamp(share / threshold - 1.0, 0.0, 1.0)

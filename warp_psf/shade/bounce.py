@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_psf.device import launch
 from warp_psf.field.radiance import SummedFields
-from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, part_of
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, find_placed, part_of
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import make_between, overlap
 from warp_psf.shade.direct import DirectState
@@ -87,7 +87,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         covers = between.lists()
         gain = between.numbers()
         for place in range(sources.count):
-            covered = kit.covered_around(world, entity_at[place], p, geometry, poses, o)
+            placed = find_placed(world, entity_at[place], geometry, poses)
+            covered = kit.covered_by(world, entity_at[place], p, placed, o)
             covers[place] = weight[place] * covered
             open_to = wp.cw_mul(open_to, values(1.0) - covers[place])
             gain[place] = between.horizon_gain(covered, surface.normal, lighting[0].weights[0], o[0].quadrature)

@@ -11,7 +11,7 @@ import warp as wp
 from warp_psf.basis import sh
 from warp_psf.basis.directions import basis_at_directions, quadrature_weights
 from warp_psf.device import launch, upload_tables
-from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, find_placed
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
@@ -175,7 +175,7 @@ def make_direct(order: int) -> SimpleNamespace:
         if wp.length_sq(facing) > 0.0:
             hidden = hidden or wp.dot(facing, p - center) <= 0.0
         if not hidden:
-            seen = kit.covered_around(world, entity, p, geometry, poses, o)
+            seen = kit.covered_by(world, entity, p, find_placed(world, entity, geometry, poses), o)
             weighted = wp.cw_mul(seen, lighting[0].weights[0])
             whole = wp.max(kit.sum_of_products(weighted, values(1.0)), 1.0e-9)
             share = wp.clamp(kit.sum_of_products(weighted, before) / whole, 0.0, 1.0)

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.directions import make_directions, project_snippet
-from warp_psf.scene.geometry import GeometryTables, PoseTables
+from warp_psf.scene.geometry import GeometryTables, PoseTables, find_placed
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.between import overlap
 from warp_psf.shade.bounce import make_bounce
@@ -115,7 +115,8 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         # All pixels around a probe on a flat face have its normal; on round bodies they do not.
         gain = between.numbers()
         for place in range(sources.count):
-            covered = kit.covered_around(world, entity_at[place], p, geometry, poses, o)
+            placed = find_placed(world, entity_at[place], geometry, poses)
+            covered = kit.covered_by(world, entity_at[place], p, placed, o)
             covers[place] = weight[place] * covered
             gain[place] = 1.0
             if patches[0].first_face[own] >= 0:

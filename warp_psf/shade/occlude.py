@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_psf.basis.sh_exp import make_sh_exp
-from warp_psf.scene.geometry import GeometryTables, PoseTables
+from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
 from warp_psf.shade.coverage import SLAB_SHAPE
 from warp_psf.shade.fades import Light, before_plane, fade_length, horizon_fade, size_fade, sphere_nearness
 from warp_psf.shade.occluders import make_occluders
@@ -39,47 +39,42 @@ def make_occlude(order: int) -> SimpleNamespace:
         own: int,
         p: wp.vec3,
         n: wp.vec3,
-        center: wp.vec3,
-        radius: float,
-        rotation: wp.mat33,
+        placed: Placed,
         o: OcclusionTables,
     ) -> float:
         """How far an entity can take light from a receiver at p with normal n: 0 not at all, its opacity fully."""
         opacity = o[0].occluders.opacity[entity]
         if entity == own or opacity <= 0.0:
             return 0.0
-        offset = center - p
+        offset = placed.center - p
         height = wp.dot(n, offset)
-        if height < -radius:
+        if height < -placed.radius:
             return 0.0
-        size = opacity * size_fade(radius, wp.dot(offset, offset))
+        size = opacity * size_fade(placed.radius, wp.dot(offset, offset))
         if o[0].occluders.shape[entity] == wp.static(SLAB_SHAPE):
             half = o[0].occluders.slab_half[entity]
-            n_slab = wp.transpose(rotation * o[0].occluders.slab_rotation[entity]) * n
+            n_slab = wp.transpose(placed.rotation * o[0].occluders.slab_rotation[entity]) * n
             rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
-            return size * wp.where(height + rise > wp.static(SLAB_HORIZON) * radius, 1.0, 0.0)
-        return size * horizon_fade(height, radius)
+            return size * wp.where(height + rise > wp.static(SLAB_HORIZON) * placed.radius, 1.0, 0.0)
+        return size * horizon_fade(height, placed.radius)
 
     @wp.func
     def nearness(
         entity: int,
         p: wp.vec3,
-        center: wp.vec3,
-        radius: float,
-        position: wp.vec3,
-        rotation: wp.mat33,
+        placed: Placed,
         light: Light,
         o: OcclusionTables,
     ) -> float:
         """How far an entity is nearer to p than a light: 1 in front of it, 0 behind it, smooth between."""
         if o[0].occluders.shape[entity] != wp.static(SLAB_SHAPE):
-            return sphere_nearness(p, center, radius, light)
+            return sphere_nearness(p, placed.center, placed.radius, light)
         half = o[0].occluders.slab_half[entity]
-        to_slab = wp.transpose(rotation * o[0].occluders.slab_rotation[entity])
+        to_slab = wp.transpose(placed.rotation * o[0].occluders.slab_rotation[entity])
         facing_slab = to_slab * light.facing
         reach = wp.abs(facing_slab[0]) * half[0] + wp.abs(facing_slab[1]) * half[1] + wp.abs(facing_slab[2]) * half[2]
-        before = before_plane(wp.dot(light.facing, center - light.center) + reach, light)
-        origin = position + rotation * o[0].occluders.slab_center[entity]
+        before = before_plane(wp.dot(light.facing, placed.center - light.center) + reach, light)
+        origin = placed.position + placed.rotation * o[0].occluders.slab_center[entity]
         p_slab = to_slab * (p - origin)
         light_slab = to_slab * (light.center - origin)
         apart = float(-1.0e30)
@@ -95,18 +90,15 @@ def make_occlude(order: int) -> SimpleNamespace:
         own: int,
         p: wp.vec3,
         n: wp.vec3,
-        position: wp.vec3,
-        rotation: wp.mat33,
-        center: wp.vec3,
-        radius: float,
+        placed: Placed,
         light: Light,
         o: OcclusionTables,
     ) -> wp.vec2:
         """How far an entity can take light from a receiver: from the environment, and from a light."""
-        weight = matters(entity, own, p, n, center, radius, rotation, o)
+        weight = matters(entity, own, p, n, placed, o)
         nearer = float(0.0)
         if weight > 0.0 and light.radius >= 0.0:
-            nearer = weight * nearness(entity, p, center, radius, position, rotation, light, o)
+            nearer = weight * nearness(entity, p, placed, light, o)
         return wp.vec2(weight, nearer)
 
     # What is accumulated over entities goes in and out of a function. In place, under a condition, a compiler would
@@ -128,14 +120,11 @@ def make_occlude(order: int) -> SimpleNamespace:
         """Multiplies visibilities with what an entity leaves, if it is not one whose logarithm is added."""
         if o[0].log_field[entity] >= 0:
             return visible
-        position = poses[0].position[world, entity]
-        rotation = poses[0].rotation[world, entity]
-        radius = geometry[0].radius[entity]
-        center = position + rotation * geometry[0].center[entity]
-        weights = weights_of(entity, own, p, n, position, rotation, center, radius, light, o)
+        placed = find_placed(world, entity, geometry, poses)
+        weights = weights_of(entity, own, p, n, placed, light, o)
         if weights[0] <= 0.0:
             return visible
-        return multiply(visible, kit.covered_by(world, entity, p, position, rotation, center, radius, o), weights)
+        return multiply(visible, kit.covered_by(world, entity, p, placed, o), weights)
 
     @wp.func
     def add_entity(
@@ -153,14 +142,11 @@ def make_occlude(order: int) -> SimpleNamespace:
         """Adds the logarithm of what an entity leaves, if it is not one whose visibility is multiplied."""
         if o[0].log_field[entity] < 0:
             return logarithms
-        position = poses[0].position[world, entity]
-        rotation = poses[0].rotation[world, entity]
-        radius = geometry[0].radius[entity]
-        center = position + rotation * geometry[0].center[entity]
-        weights = weights_of(entity, own, p, n, position, rotation, center, radius, light, o)
+        placed = find_placed(world, entity, geometry, poses)
+        weights = weights_of(entity, own, p, n, placed, light, o)
         if weights[0] <= 0.0:
             return logarithms
-        return logarithms + wp.outer(weights, kit.logarithm_of(world, entity, p, position, rotation, center, radius, o))
+        return logarithms + wp.outer(weights, kit.logarithm_of(world, entity, p, placed, o))
 
     @wp.func
     def visibility_at(
@@ -183,9 +169,9 @@ def make_occlude(order: int) -> SimpleNamespace:
         light = Light()
         light.radius = -1.0
         if light_entity >= 0:
-            rotation = poses[0].rotation[world, light_entity]
-            light.center = poses[0].position[world, light_entity] + rotation * geometry[0].center[light_entity]
-            light.radius = geometry[0].radius[light_entity]
+            placed = find_placed(world, light_entity, geometry, poses)
+            light.center = placed.center
+            light.radius = placed.radius
             light.facing = light_facing
         visible = both_values(1.0)
         entities = geometry[0].entity_mesh.shape[0]

@@ -18,7 +18,7 @@ from warp_psf.basis.sh_exp import make_sh_exp, upload_exponential
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.shells import ShadowField, make_fields, upload_fields
 from warp_psf.field.spheres import SphereTables
-from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
+from warp_psf.scene.geometry import DeviceScene, Placed, PoseTables
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
@@ -29,7 +29,7 @@ COVERAGE, LOGARITHM = 0, 1
 
 @cache
 def make_occluders(order: int) -> SimpleNamespace:
-    """Device functions for `order` bands: `covered_by`, `covered_around`, `logarithm_of`, and their table."""
+    """Device functions for `order` bands: `covered_by`, `logarithm_of`, and their table."""
     kit = make_coverage(order)
     values, half_values = kit.values, kit.half_values
     OccluderTable, FieldTable = kit.OccluderTable, make_fields(order).FieldTable
@@ -61,66 +61,43 @@ def make_occluders(order: int) -> SimpleNamespace:
         world: int,
         entity: int,
         p: wp.vec3,
-        position: wp.vec3,
-        rotation: wp.mat33,
-        center: wp.vec3,
-        radius: float,
+        placed: Placed,
         o: OcclusionTables,
     ) -> values:
-        """The part of the directions around a point of the world that an entity covers: 1 where it does, 0 elsewhere.
-
-        position, rotation: the entity's pose; center, radius: its bounding sphere, in the world.
-        """
+        """The part of the directions around a point of the world that an entity covers: 1 where it does, else 0."""
         shape = o[0].occluders.shape[entity]
         if shape == wp.static(FIELD_SHAPE):
-            p_body = wp.transpose(rotation) * (p - position)
+            p_body = wp.transpose(placed.rotation) * (p - placed.position)
             return kit.at_directions(
                 lookup(o[0].fields, wp.static(COVERAGE), o[0].occluders.field[entity], p_body), o[0].rows[world, entity]
             )
         if shape == wp.static(SPHERE_SHAPE):
-            offset = center - p
+            offset = placed.center - p
             distance = wp.length(offset)
             # Inside, by contact, counts as on the surface.
-            sine = wp.min(radius / wp.max(distance, 1.0e-9), 1.0)
+            sine = wp.min(placed.radius / wp.max(distance, 1.0e-9), 1.0)
             return kit.cap_coverage(offset / wp.max(distance, 1.0e-9), sine, o[0].quadrature)
         if shape == wp.static(SLAB_SHAPE):
-            to_world = rotation * o[0].occluders.slab_rotation[entity]
-            p_slab = wp.transpose(to_world) * (p - position - rotation * o[0].occluders.slab_center[entity])
+            to_world = placed.rotation * o[0].occluders.slab_rotation[entity]
+            origin = placed.position + placed.rotation * o[0].occluders.slab_center[entity]
+            p_slab = wp.transpose(to_world) * (p - origin)
             return kit.slab_coverage(p_slab, o[0].occluders.slab_half[entity], to_world, o[0].quadrature)
         return values()
-
-    @wp.func
-    def covered_around(
-        world: int,
-        entity: int,
-        p: wp.vec3,
-        geometry: GeometryTables,
-        poses: PoseTables,
-        o: OcclusionTables,
-    ) -> values:
-        """The same, of an entity where it is in this frame."""
-        position = poses[0].position[world, entity]
-        rotation = poses[0].rotation[world, entity]
-        center = position + rotation * geometry[0].center[entity]
-        return covered_by(world, entity, p, position, rotation, center, geometry[0].radius[entity], o)
 
     @wp.func
     def logarithm_of(
         world: int,
         entity: int,
         p: wp.vec3,
-        position: wp.vec3,
-        rotation: wp.mat33,
-        center: wp.vec3,
-        radius: float,
+        placed: Placed,
         o: OcclusionTables,
     ) -> vec:
-        """The logarithm of what an entity leaves visible around a point of the world, as in `covered_by`."""
+        """The logarithm of what an entity leaves visible around a point of the world."""
         if o[0].occluders.shape[entity] == wp.static(SPHERE_SHAPE):
-            offset = center - p
+            offset = placed.center - p
             distance = wp.max(wp.length(offset), 1.0e-9)
-            return logs.cap_logarithm(offset / distance, wp.min(radius / distance, 1.0), o[0].exponential)
-        p_body = wp.transpose(rotation) * (p - position)
+            return logs.cap_logarithm(offset / distance, wp.min(placed.radius / distance, 1.0), o[0].exponential)
+        p_body = wp.transpose(placed.rotation) * (p - placed.position)
         return rotate(
             lookup(o[0].fields, wp.static(LOGARITHM), o[0].log_field[entity], p_body), o[0].turns[world, entity]
         )
@@ -151,7 +128,6 @@ def make_occluders(order: int) -> SimpleNamespace:
         Occlusion=Occlusion,
         OcclusionTables=OcclusionTables,
         covered_by=covered_by,
-        covered_around=covered_around,
         logarithm_of=logarithm_of,
         turn_basis=turn_basis,
     )
