@@ -120,7 +120,7 @@ def print_angles(center: np.ndarray, radius: np.ndarray, size: float) -> list[di
             expected, _, _ = oracles_log.run_method(plane, "TRIP", ORDER, repeats=1)
             for inversion in (True, False):
                 logarithm = oracles_log.log_sum(plane, ORDER, inversion)
-                errors.append(relative(psf_exponential(logarithm), expected))
+                errors.append(relative(exponentiate(logarithm), expected))
         print(f"  {angle:10.2f}" + " " * 34 + "{:11.4f}{:13.4f}{:13.4f}{:13.4f}".format(*errors))
         rows.append({"angle": float(angle), "sphere": errors[:2], "body": errors[2:]})
     return rows
@@ -131,14 +131,15 @@ def print_logarithms(center: np.ndarray, radius: np.ndarray, side: float) -> dic
     plane = oracles_log.make_plane(center, radius, side, 48)
     expected, _, _ = oracles_log.run_method(plane, "TRIP", ORDER, repeats=1)
     errors = {
-        name: relative(psf_exponential(oracles_log.log_sum(plane, ORDER, inversion)), expected)
+        name: relative(exponentiate(oracles_log.log_sum(plane, ORDER, inversion)), expected)
         for name, inversion in (("inversion", True), ("integration", False))
     }
     print("\nfigure 2, RMS on the plane: " + ", ".join(f"{name} {error:.4f}" for name, error in errors.items()))
     return errors
 
 
-def psf_exponential(logarithm: np.ndarray) -> np.ndarray:
+def exponentiate(logarithm: np.ndarray) -> np.ndarray:
+    """PS*-9, with which the figures compare the logarithms."""
     return oracles_log.sh_exp.scaled_power_series(logarithm, 9)
 
 

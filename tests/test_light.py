@@ -275,8 +275,8 @@ def test_a_sphere_light_is_a_sphere_about_its_position():
     assert lamp.mesh.sphere == pytest.approx(0.3)
     np.testing.assert_array_equal(lamp.position, [0.0, 1.0, 2.0])
     assert lamp.body == "arm"
-    for radius in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match=f"light 'lamp': radius is {radius}; give a positive number of metres"):
+    for radius in (0.0, -1.0, np.nan, np.inf, "wide", None):
+        with pytest.raises(ValueError, match=f"light 'lamp': radius is {radius!r}; give a positive number of metres"):
             sphere_light("lamp", radius, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 import warp_psf as psf
 from warp_psf import bridge
 from warp_psf.bridge import solids
+from warp_psf.scene.loose import make_room
 
 KIND = mujoco.mjtObj
 TENDON = """
@@ -227,3 +230,16 @@ def test_added_geoms_that_name_nothing_are_refused(change, reason):
         # Nothing is lost: the next state is drawn as before.
         renderer.update_scene(data, "front")
         np.testing.assert_array_equal(renderer.render(), picture)
+
+
+def test_a_room_holds_no_deforming_body_that_it_has_not_met():
+    model, data = start(CLOTH)
+    loose, _ = read(model, data)
+    assert loose is not None
+    room = make_room(loose)
+    assert [shape.name for shape in room.shapes] == ["cloth", "rope"] and room.holds(loose)
+    met = replace(room, shapes=room.shapes[:1])
+    assert not met.holds(loose)
+    larger = make_room(loose, met)
+    assert larger.holds(loose)
+    assert larger.shapes[0] is room.shapes[0]  # fitted to the shape in which it was met

@@ -12,9 +12,11 @@ import warp_psf as psf
 from benchmarks.accuracy import pixel_points
 from sims import figure
 from tests.oracles import loose_triangles, shade_points, traced_irradiance
-from warp_psf.bake.sphere_set import share_rays
+from warp_psf.bake.sphere_set import bake_spheres, share_rays
 from warp_psf.device import find_device
 from warp_psf.field.spheres import SphereSet, build_tree, place_nodes
+from warp_psf.field.store import load_arrays, save_arrays
+from warp_psf.scene import primitives
 from warp_psf.scene.receiver import make_receivers
 from warp_psf.shade.spheres import CLUSTER, CUT_SINE, MOST_IN_CUT, SphereState, choose_cuts, make_cuts, upload_spheres
 
@@ -120,6 +122,28 @@ def test_a_cut_that_would_be_too_large_is_coarser():
     assert sorted(leaves) == list(range(3 * MOST_IN_CUT))
 
 
+def test_many_small_spheres_are_no_small_body():
+    spheres, center = scatter(96)
+    small = dataclasses.replace(spheres, radius=np.full(96, 0.004))
+    # Next to the cube each takes less than a thousandth of the view, and together they do not.
+    (cut,) = cut_of(small, center, np.array([0.5, 0.5, 1.2]) + RANDOM.uniform(-0.05, 0.05, (CLUSTER, 3)))
+    assert sum(int(spheres.leaves[node]) for node in cut) == 96
+
+
+@pytest.mark.parametrize("spoil", [np.negative, np.zeros_like, lambda radius: 1e300 * radius, lambda radius: radius[0]])
+def test_damaged_spheres_are_fitted_again(monkeypatch, tmp_path, spoil):
+    monkeypatch.setenv("WARP_PSF_CACHE", str(tmp_path))
+    mesh = primitives.capsule(0.1, 0.2)
+    expected = bake_spheres(mesh, 6)
+    (file,) = tmp_path.iterdir()
+    kept = load_arrays(file.stem)
+    assert kept is not None
+    save_arrays(file.stem, kept | {"radius": spoil(kept["radius"])})
+    with pytest.warns(UserWarning, match="they are fitted again"):
+        found = bake_spheres(mesh, 6)
+    np.testing.assert_array_equal(found.radius, expected.radius)
+
+
 # A skin in a scene
 
 
@@ -188,6 +212,29 @@ def test_under_a_point_light_deforming_bodies_cast_shadows_and_tendons_do_not():
     # The tendon's shadow would lie at y = 1.8.
     assert (beside & (abs(y - 1.8) < 0.05) & (abs(x) < 0.8)).any()
     assert (lit[beside & (np.hypot(x, y) < 2.0)] > 0.0).all()
+
+
+def test_a_flex_gone_astray_darkens_nothing():
+    xml = """
+<mujoco>
+  <visual><headlight active="0"/></visual>
+  <worldbody>
+    <geom type="plane" size="5 5 .1"/>
+    <flexcomp name="cloth" type="grid" count="4 4 1" spacing=".1 .1 .1" pos="0 0 .4" radius=".01" dim="2" mass="1"/>
+  </worldbody>
+</mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    points, normals = ground(4)
+    with psf.Renderer(model, 4, 4, bounces=0) as renderer:
+        data.flexvert_xpos[:] = np.nan
+        renderer.update_scene(data)
+        renderer.layers()
+        found, _ = shade_points(renderer, renderer._stage.scene.entities[0].name, points, normals)
+    # Without a shadow every point of a plane is lit alike.
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], found.shape), rtol=1e-5)
+    assert found.min() > 0.0
 
 
 def test_a_skin_that_is_not_shown_casts_no_shadow(walking):

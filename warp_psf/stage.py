@@ -141,7 +141,7 @@ def set_stage(
             radiance = np.ones(len(light.mesh.faces), np.float32)
             fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
     device_scene = upload_scene(scene, 1, device)
-    shapes = () if room is None else room.shapes
+    shapes = () if room is None else tuple(shape for shape in room.shapes if shape.casts)
     sets = bake_sphere_sets(shapes, str(device), progress)
     spheres = upload_spheres(shapes, sets, scene.loose, 1, device)
     occlusion = upload_occlusion(scene, fields, log_fields, spheres.tables, order, 1, device)

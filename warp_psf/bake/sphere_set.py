@@ -25,6 +25,8 @@ SPHERES = 96
 # hundredth of the projected area from each direction.
 WEIGHT_DIRECTIONS = 24
 WEIGHT_RAYS = 96
+# In bounding radii: no sphere that approximates a body is larger.
+LARGEST_RADIUS = 2.0
 
 
 def bake_spheres(mesh: Mesh, count: int = SPHERES, *, device: str | None = None, use_cache: bool = True) -> SphereSet:
@@ -87,7 +89,7 @@ def _load(key: str, unit: Mesh) -> dict[str, np.ndarray] | None:
     arrays = load_arrays(key)
     if arrays is None:
         return None
-    spheres = len(arrays.get("radius", ()))
+    spheres = arrays["radius"].size if "radius" in arrays else 0
     layout: dict[str, tuple[type, tuple[int, ...] | None]] = {
         "center": (np.float64, (spheres, 3)),
         "radius": (np.float64, (spheres,)),
@@ -96,9 +98,9 @@ def _load(key: str, unit: Mesh) -> dict[str, np.ndarray] | None:
         "surface": (np.float32, (len(unit.vertices), 6)),
     }
     wrong = find_unlike(arrays, layout)
-    if wrong is None and not (
-        spheres and 0 <= arrays["vertices"].min() <= arrays["vertices"].max() < len(unit.vertices)
-    ):
+    if wrong is None and not (spheres and ((arrays["radius"] > 0) & (arrays["radius"] <= LARGEST_RADIUS)).all()):
+        wrong = "radius"
+    if wrong is None and not 0 <= arrays["vertices"].min() <= arrays["vertices"].max() < len(unit.vertices):
         wrong = "vertices"
     if wrong is not None:
         warnings.warn(

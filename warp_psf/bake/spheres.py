@@ -8,6 +8,7 @@ Each sphere in turn moves and grows to what serves best beside the others; the l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 import warp as wp
@@ -90,11 +91,11 @@ def fit_spheres(mesh: Mesh, count: int, *, device: str | None = None) -> SphereF
     sphere has the projected area of its part of the surface.
 
     Raises:
-        ValueError: the count is less than 1, or there is no such device.
+        ValueError: the count is no whole number of at least 1, or there is no such device.
     """
-    if not count >= 1:
+    if not isinstance(count, Integral) or count < 1:
         raise ValueError(f"mesh {mesh.name!r}: cannot be approximated by {count} spheres; ask for at least 1")
-    count = min(count, MOST_SPHERES)
+    count = min(int(count), MOST_SPHERES)
     unit = unit_shape(mesh)
     # Cells along the principal axes fit a board or a rod however it is turned.
     axes = np.linalg.eigh(np.cov(unit.vertices.astype(np.float64).T))[1]

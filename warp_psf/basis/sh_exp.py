@@ -244,7 +244,7 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 def make_sh_exp(order: int) -> SimpleNamespace:
     """Device functions for `order` bands, each of which takes the `ExpTable` that `upload_exponential` fills.
 
-    exponential(f, table), power_series(f, degree, table), scaled_power_series(f, degree, table),
+    exponential(f, table), power_series(f, degree, table), scaled_power_series(f, degree, series_norm(degree), table),
     optimal_linear(f, table), hybrid(f, table): the twins of the host's; exponential_at_directions(f, table): the values
     of the first; product(f, g, table): the truncated product;
     cap_logarithm(axis, sine, table): log_*(1 - cap) about a unit axis, by the sine of the half-angle, from a table.

@@ -85,6 +85,7 @@ class SphereTable:
     radius: wp.array2d(dtype=wp.float32)  # (world, node), metres
     weight: wp.array2d(dtype=wp.float32)  # (world, node): 0 while the body is not shown
     leaves: wp.array(dtype=wp.int32)  # (node)
+    root: wp.array(dtype=wp.int32)  # (node): of its tree
     entity: wp.array(dtype=wp.int32)  # (node): whose body it is
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -145,8 +146,7 @@ def rectangle_light(
     """
     owner = f"light {name!r}"
     for side, value in (("width", width), ("height", height)):
-        if not SHORTEST_LENGTH < value < np.inf:
-            raise ValueError(f"{owner}: {side} is {value}; give a positive number of metres")
+        _check_length(value, owner, side)
     if target is not None and rotation is not None:
         raise ValueError(f"{owner}: both target and rotation are given; give one of them")
     position = _numbers(position, (3,), owner, "position")
@@ -169,8 +169,7 @@ def sphere_light(name: str, radius: float, radiance, position, *, body: str | No
     Raises:
         ValueError: the radius is not positive, or a value is not usable.
     """
-    if not SHORTEST_LENGTH < radius < np.inf:
-        raise ValueError(f"light {name!r}: radius is {radius}; give a positive number of metres")
+    _check_length(radius, f"light {name!r}", "radius")
     return AreaLight(name, sphere(radius), radiance, position, body=body)
 
 
@@ -201,6 +200,11 @@ def area_light_entities(scene: Scene) -> tuple[tuple[AreaLight, int], ...]:
     lights = [light for light in scene.lights if isinstance(light, AreaLight)]
     first = len(scene.entities) - len(lights)
     return tuple((light, first + offset) for offset, light in enumerate(lights))
+
+
+def _check_length(value, owner: str, part: str) -> None:
+    if not isinstance(value, Real) or not SHORTEST_LENGTH < value < np.inf:
+        raise ValueError(f"{owner}: {part} is {value!r}; give a positive number of metres")
 
 
 def _numbers(value, shape: tuple[int, ...], owner: str, part: str) -> np.ndarray:

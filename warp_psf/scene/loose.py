@@ -31,12 +31,16 @@ class Loose:
     first_vertex: np.ndarray
     deforming: np.ndarray
 
-    def shape(self, name: str, vertices: int) -> np.ndarray | None:
-        """Where the vertices of the deforming body of this name are, [V, 3]; None if it does not have so many."""
-        for index in np.flatnonzero(self.deforming):
-            rows = slice(*self.first_vertex[index : index + 2])
-            if self.parts[index].name == name and rows.stop - rows.start == vertices:
-                return self.vertices[rows]
+    def deforming_keys(self) -> list[tuple[str, int]]:
+        """Of each deforming body its name and how many vertices it has: those of another number are another body."""
+        counts = np.diff(self.first_vertex)
+        return [(self.parts[index].name, int(counts[index])) for index in np.flatnonzero(self.deforming)]
+
+    def vertices_of(self, shape: DeformingShape) -> np.ndarray | None:
+        """Where the vertices of a deforming body are now, [V, 3]; None when it is not shown."""
+        for index, key in zip(np.flatnonzero(self.deforming), self.deforming_keys(), strict=True):
+            if key == (shape.name, len(shape.vertices)):
+                return self.vertices[slice(*self.first_vertex[index : index + 2])]
         return None
 
 
@@ -48,10 +52,15 @@ class DeformingShape:
     vertices: np.ndarray
     faces: np.ndarray
 
+    @property
+    def casts(self) -> bool:
+        """Whether it has a surface that spheres can be fitted to."""
+        return bool(np.isfinite(self.vertices).all() and area_vectors(self.vertices, self.faces).any())
+
 
 @dataclass(frozen=True)
 class LooseRoom:
-    """How much of it there is room for, and the deforming bodies in it that cast shadows."""
+    """How much of it there is room for, and the deforming bodies that were in it so far."""
 
     vertices: int
     faces: int
@@ -59,7 +68,10 @@ class LooseRoom:
     shapes: tuple[DeformingShape, ...]
 
     def holds(self, loose: Loose) -> bool:
-        """Whether there is room for all of this."""
+        """Whether there is room for all of this, and every deforming body is known."""
+        known = {(shape.name, len(shape.vertices)) for shape in self.shapes}
+        if not known.issuperset(loose.deforming_keys()):
+            return False
         sizes = len(loose.vertices), len(loose.faces), len(loose.parts)
         return all(size <= room for size, room in zip(sizes, (self.vertices, self.faces, self.parts), strict=True))
 
@@ -69,16 +81,13 @@ def make_room(loose: Loose, before: LooseRoom | None = None) -> LooseRoom:
 
     before: a room that has become too small. Bodies that were in it keep the shape that they had when it was made.
     """
-    known = {} if before is None else {(shape.name, len(shape.vertices)): shape for shape in before.shapes}
-    shapes = []
-    for index in np.flatnonzero(loose.deforming):
+    shapes = {} if before is None else {(shape.name, len(shape.vertices)): shape for shape in before.shapes}
+    for index, key in zip(np.flatnonzero(loose.deforming), loose.deforming_keys(), strict=True):
         start, end = loose.first_vertex[index : index + 2]
-        name, faces = loose.parts[index].name, loose.faces[loose.face_part == index] - start
-        shape = known.get((name, end - start)) or DeformingShape(name, loose.vertices[start:end], faces)
-        if area_vectors(shape.vertices, shape.faces).any():  # what has no surface casts no shadow
-            shapes.append(shape)
+        faces = loose.faces[loose.face_part == index] - start
+        shapes.setdefault(key, DeformingShape(key[0], loose.vertices[start:end], faces))
     sizes = (max(16, size + size // 2) for size in (len(loose.vertices), len(loose.faces), len(loose.parts)))
-    return LooseRoom(*sizes, shapes=tuple(shapes))
+    return LooseRoom(*sizes, shapes=tuple(shapes.values()))
 
 
 def reserve(room: LooseRoom, mesh: int) -> tuple[Mesh, Entity]:
