@@ -1,0 +1,281 @@
+"""Deforming bodies shadow themselves: hemispherical rasterisation (Kautz 2004).
+
+In every frame each vertex that is seen rasterises the triangles around it into its visibility mask, and integrates what
+remains open against spherical harmonics and the cosine. The result, its transfer, is what other bodies keep from their
+bake; from there on a deforming body is shaded as they are.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warp_psf.basis.visibility_mask import (
+    QUEUE,
+    MaskTables,
+    cover,
+    make_masks,
+    mask,
+    plane_of,
+    queue,
+    queue_up,
+)
+from warp_psf.device import launch, upload_tables
+from warp_psf.field.blockers import BlockerSet
+
+# The origin of a mask leaves the surface by this share of the body's radius, as in the bake of rigid bodies: faces that
+# meet at a vertex then hide what they should of its valleys.
+ORIGIN_OFFSET = 1.0e-3
+# A triangle with less than this volume between unit vectors to its corners is seen edge-on: it spans 1e-6 sr, a
+# thousandth of a pixel, and its planes would be those of rounding.
+EDGE_ON = 2.0e-6
+
+
+@wp.struct
+class BlockerTable:
+    """A deforming body's vertices and what hides it from itself; see `BlockerSet`."""
+
+    position: wp.array2d(dtype=wp.vec3)  # (world, vertex): of those seen, metres, in the world
+    normal: wp.array2d(dtype=wp.vec3)  # (world, vertex)
+    needed: wp.array2d(dtype=wp.int32)  # (world, vertex): 1 where its mask is to be found
+    blocker_of: wp.array(dtype=wp.int32)  # (vertex)
+    blocker: wp.array2d(dtype=wp.vec3)  # (world, blocker vertex), metres, in the world
+    faces: wp.array(dtype=wp.vec3i)  # (triangle)
+    first_of_cluster: wp.array(dtype=wp.int32)  # (cluster + 1)
+    lower: wp.array2d(dtype=wp.vec3)  # (world, cluster): corners of its box, metres
+    upper: wp.array2d(dtype=wp.vec3)  # (world, cluster)
+    first_near: wp.array(dtype=wp.int32)  # (blocker vertex + 1)
+    near: wp.array(dtype=wp.int32)
+    first_skip: wp.array(dtype=wp.int32)  # (blocker vertex + 1)
+    skip: wp.array(dtype=wp.int32)
+    two_sided: wp.bool
+    offset: wp.float32  # of a mask's origin from its vertex, metres
+    masks: wp.array2d(dtype=mask)  # (world, vertex): what is blocked
+
+
+BlockerTables = wp.array(dtype=BlockerTable)
+
+
+@wp.struct
+class Horizon:
+    """The frame in which a mask is drawn: its origin, and axes the last of which is the normal."""
+
+    origin: wp.vec3
+    tangent: wp.vec3
+    bitangent: wp.vec3
+    normal: wp.vec3
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _bound_clusters(first: int, blockers: BlockerTables):
+    world, cluster = wp.tid()
+    cluster += first
+    lower = wp.vec3(1.0e30, 1.0e30, 1.0e30)
+    upper = -lower
+    for triangle in range(blockers[0].first_of_cluster[cluster], blockers[0].first_of_cluster[cluster + 1]):
+        corners = blockers[0].faces[triangle]
+        for corner in range(3):
+            place = blockers[0].blocker[world, corners[corner]]
+            lower = wp.min(lower, place)
+            upper = wp.max(upper, place)
+    blockers[0].lower[world, cluster] = lower
+    blockers[0].upper[world, cluster] = upper
+
+
+@wp.func
+def horizon_of(world: int, vertex: int, blockers: BlockerTables) -> Horizon:
+    horizon = Horizon()
+    n = blockers[0].normal[world, vertex]
+    level = wp.sqrt(n[0] * n[0] + n[1] * n[1])
+    x = wp.where(level > 1.0e-6, n[0] / level, 1.0)
+    y = wp.where(level > 1.0e-6, n[1] / level, 0.0)
+    horizon.origin = blockers[0].position[world, vertex] + blockers[0].offset * n
+    horizon.tangent = wp.vec3(n[2] * x, n[2] * y, -level)
+    horizon.bitangent = wp.vec3(-y, x, 0.0)
+    horizon.normal = n
+    return horizon
+
+
+@wp.func
+def plane_above(normal: wp.vec3, horizon: Horizon) -> int:
+    """The table's plane through the origin that has this normal, in the world."""
+    return plane_of(
+        wp.vec3(wp.dot(horizon.tangent, normal), wp.dot(horizon.bitangent, normal), wp.dot(horizon.normal, normal))
+    )
+
+
+@wp.func
+def planes_of(world: int, triangle: int, horizon: Horizon, blockers: BlockerTables) -> wp.vec3i:
+    """The planes above which a triangle lies as it is seen from the origin; 0 where it hides nothing."""
+    corners = blockers[0].faces[triangle]
+    a = blockers[0].blocker[world, corners[0]] - horizon.origin
+    b = blockers[0].blocker[world, corners[1]] - horizon.origin
+    c = blockers[0].blocker[world, corners[2]] - horizon.origin
+    highest = wp.max(wp.max(wp.dot(horizon.normal, a), wp.dot(horizon.normal, b)), wp.dot(horizon.normal, c))
+    if highest <= 0.0:
+        return wp.vec3i()
+    normal = wp.cross(a, b)
+    volume = wp.dot(normal, c)
+    if volume > 0.0 and not blockers[0].two_sided:
+        return wp.vec3i()  # seen from behind: the front of the body hides as much
+    if volume * volume <= wp.static(EDGE_ON**2) * wp.length_sq(a) * wp.length_sq(b) * wp.length_sq(c):
+        return wp.vec3i()
+    side = wp.where(volume > 0.0, 1.0, -1.0)
+    return wp.vec3i(
+        plane_above(side * normal, horizon),
+        plane_above(side * wp.cross(b, c), horizon),
+        plane_above(side * wp.cross(c, a), horizon),
+    )
+
+
+@wp.func
+def draw(
+    covered: mask,
+    waiting: queue,
+    world: int,
+    triangle: int,
+    horizon: Horizon,
+    blockers: BlockerTables,
+    masks: MaskTables,
+):
+    """Sends a triangle into the queue, and draws the first one that waits there."""
+    # What lies above three planes is the triangle's image, wherever the horizon cuts it.
+    planes = planes_of(world, triangle, horizon, blockers)
+    if planes[0] == 0:
+        return covered, waiting
+    return cover(covered, masks[0].planes, waiting[0]), queue_up(waiting, masks[0].planes, planes)
+
+
+@wp.func
+def is_above(world: int, cluster: int, horizon: Horizon, blockers: BlockerTables) -> bool:
+    """Whether any of a cluster's box rises above the horizon."""
+    lower = blockers[0].lower[world, cluster]
+    upper = blockers[0].upper[world, cluster]
+    n = horizon.normal
+    reach = wp.dot(wp.vec3(wp.abs(n[0]), wp.abs(n[1]), wp.abs(n[2])), upper - lower)
+    return wp.dot(n, upper + lower - 2.0 * horizon.origin) + reach > 0.0
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _rasterise(first: int, blockers: BlockerTables, masks: MaskTables):
+    world, vertex = wp.tid()
+    vertex += first
+    if blockers[0].needed[world, vertex] == 0:
+        return
+    horizon = horizon_of(world, vertex, blockers)
+    place = blockers[0].blocker_of[vertex]
+    covered = mask()
+    waiting = queue()
+    for index in range(blockers[0].first_near[place], blockers[0].first_near[place + 1]):
+        covered, waiting = draw(covered, waiting, world, blockers[0].near[index], horizon, blockers, masks)
+    skip = int(blockers[0].first_skip[place])
+    last_skip = blockers[0].first_skip[place + 1]
+    for cluster in range(blockers[0].first_of_cluster.shape[0] - 1):
+        if is_above(world, cluster, horizon, blockers):
+            for triangle in range(blockers[0].first_of_cluster[cluster], blockers[0].first_of_cluster[cluster + 1]):
+                # Those that are skipped are in ascending order, as triangles are.
+                while skip < last_skip and blockers[0].skip[skip] < triangle:
+                    skip += 1
+                if skip == last_skip or blockers[0].skip[skip] != triangle:
+                    covered, waiting = draw(covered, waiting, world, triangle, horizon, blockers, masks)
+    for position in range(wp.static(QUEUE)):
+        covered = cover(covered, masks[0].planes, waiting[position])
+    blockers[0].masks[world, vertex] = covered
+
+
+@cache
+def make_hemisphere(order: int) -> SimpleNamespace:
+    """The kernels that integrate masks against `order` bands."""
+    kit = make_masks(order)
+    vec = kit.vec
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def integrate(
+        first: int,
+        blockers: BlockerTables,
+        masks: MaskTables,
+        first_row: int,
+        transfer_out: wp.array(dtype=vec),  # (row)
+        visibility_out: wp.array(dtype=vec),  # (row)
+    ):
+        world, vertex = wp.tid()
+        vertex += first
+        if blockers[0].needed[world, vertex] == 0:
+            return
+        normal = blockers[0].normal[world, vertex]
+        covered = blockers[0].masks[world, vertex]
+        both = kit.open_transfer(covered, normal, masks)
+        row = first_row + world * blockers[0].position.shape[1] + vertex
+        transfer_out[row] = both[0]
+        visibility_out[row] = both[1]
+
+    return SimpleNamespace(vec=vec, integrate=integrate)
+
+
+@dataclass(frozen=True, eq=False)
+class HemisphereState:
+    """A deforming body on the device: `table` is the one that the array `tables` holds."""
+
+    table: BlockerTable
+    tables: wp.array
+
+
+def upload_blockers(
+    blockers: BlockerSet, blocker_of: np.ndarray, radius: float, worlds: int, device: wp.Device
+) -> HemisphereState:
+    """Room for the vertices and masks of a deforming body.
+
+    blocker_of: the blocker vertex of each seen vertex, int32 [V]. radius: of the body at rest, metres.
+    """
+    table = BlockerTable()
+    shape = (worlds, len(blocker_of))
+    table.position = wp.zeros(shape, dtype=wp.vec3, device=device)
+    table.normal = wp.zeros(shape, dtype=wp.vec3, device=device)
+    table.needed = wp.zeros(shape, dtype=wp.int32, device=device)
+    table.blocker_of = wp.array(blocker_of, dtype=wp.int32, device=device)
+    table.blocker = wp.zeros((worlds, len(blockers.first_near) - 1), dtype=wp.vec3, device=device)
+    table.faces = wp.array(blockers.faces, dtype=wp.vec3i, device=device)
+    clusters = len(blockers.first_of_cluster) - 1
+    table.lower = wp.zeros((worlds, clusters), dtype=wp.vec3, device=device)
+    table.upper = wp.zeros((worlds, clusters), dtype=wp.vec3, device=device)
+    for name in ("first_of_cluster", "first_near", "near", "first_skip"):
+        setattr(table, name, wp.array(getattr(blockers, name), dtype=wp.int32, device=device))
+    # A kernel may read, but not use, what stands behind the last one.
+    table.skip = wp.array(np.append(blockers.skip, -1), dtype=wp.int32, device=device)
+    table.two_sided = blockers.two_sided
+    table.offset = ORIGIN_OFFSET * radius
+    table.masks = wp.zeros(shape, dtype=mask, device=device)
+    return HemisphereState(table, upload_tables([table], BlockerTable, device))
+
+
+def bring_shape(
+    state: HemisphereState, vertices: np.ndarray, normals: np.ndarray, blocker_vertices: np.ndarray, device: wp.Device
+) -> None:
+    """Brings the shape of a frame to the device: float32 [worlds, V, 3] twice, and [worlds, B, 3]."""
+    state.table.position.assign(vertices)
+    state.table.normal.assign(normals)
+    state.table.blocker.assign(blocker_vertices)
+    launch(_bound_clusters, state.table.lower.shape, [state.tables], [], device)
+
+
+def rasterise_masks(state: HemisphereState, masks: wp.array, device: wp.Device) -> None:
+    """Finds the masks of the vertices that are needed."""
+    launch(_rasterise, state.table.position.shape, [state.tables, masks], [], device)
+
+
+def integrate_masks(
+    state: HemisphereState,
+    masks: wp.array,
+    order: int,
+    first_row: int,
+    transfer: wp.array,
+    visibility: wp.array,
+    device: wp.Device,
+) -> None:
+    """Writes transfer (visibility times the clamped cosine) and visibility of the vertices that are needed, on `order`
+    bands, into rows from `first_row` on, world by world."""
+    inputs = [state.tables, masks, first_row]
+    outputs = [transfer, visibility]
+    launch(make_hemisphere(order).integrate, state.table.position.shape, inputs, outputs, device)
