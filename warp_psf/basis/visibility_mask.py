@@ -54,13 +54,15 @@ def pixel_directions() -> np.ndarray:
 
 
 def plane_normals() -> np.ndarray:
-    """Normals of the table's planes, float64 [6 * 128 * 128, 3], not of unit length: through the cells' centres."""
-    face, row, column = np.indices((6, CUBE_EDGE, CUBE_EDGE)).reshape(3, -1)
-    across = (np.stack([column, row]) + 0.5) * 2.0 / CUBE_EDGE - 1.0
-    axis, normals, places = face // 2, np.empty((len(face), 3)), np.arange(len(face))
-    normals[places, axis] = np.where(face % 2 == 0, 1.0, -1.0)
-    normals[places, (axis + 1) % 3], normals[places, (axis + 2) % 3] = across
-    return normals
+    """Normals of the table's planes, float64 [6 * 128 * 128, 3], not of unit length.
+
+    They go through the cells' centres on the cube's faces towards x, y and z; the second half are their opposites.
+    """
+    face, row, column = np.indices((3, CUBE_EDGE, CUBE_EDGE)).reshape(3, -1)
+    normals, planes = np.ones((len(face), 3)), np.arange(len(face))
+    normals[planes, (face + 1) % 3] = (column + 0.5) * 2.0 / CUBE_EDGE - 1.0
+    normals[planes, (face + 2) % 3] = (row + 0.5) * 2.0 / CUBE_EDGE - 1.0
+    return np.concatenate([normals, -normals])
 
 
 @cache
@@ -127,6 +129,14 @@ MaskTables = wp.array(dtype=MaskTable)
 def find_above(normal: wp.vec3, pixels: wp.array(dtype=wp.vec3), inside: wp.array(dtype=wp.uint64)) -> mask: ...
 
 
+@wp.func_native(f"""
+    wp::vec_t<{WORDS}, uint64_t> rest;
+    for (int word = 0; word < {WORDS}; ++word) rest[word] = inside.data[word] & ~covered[word];
+    return rest;
+""")
+def find_rest(covered: mask, inside: wp.array(dtype=wp.uint64)) -> mask: ...
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _fill_planes(
     first: int,
@@ -135,9 +145,12 @@ def _fill_planes(
     inside: wp.array(dtype=wp.uint64),
     planes_out: wp.array(dtype=mask),
 ):
-    _, cell = wp.tid()
-    cell += first
-    planes_out[1 + cell] = find_above(normals[cell], pixels, inside)
+    _, plane = wp.tid()
+    plane += first
+    above = find_above(normals[plane], pixels, inside)
+    planes_out[1 + plane] = above
+    # What is not above a plane is above its opposite: triangles that share an edge leave no pixel between them.
+    planes_out[1 + plane + normals.shape[0]] = find_rest(above, inside)
 
 
 @wp.func
@@ -148,10 +161,11 @@ def plane_of(normal: wp.vec3) -> int:
     z = wp.abs(normal[2])
     axis = wp.where(z > wp.max(x, y), 2, wp.where(y > x, 1, 0))
     along = normal[axis]
-    scale = wp.static(0.5 * CUBE_EDGE) / wp.max(wp.abs(along), 1.0e-30)
+    # The same cell for a plane and its opposite.
+    scale = wp.static(0.5 * CUBE_EDGE) / wp.where(wp.abs(along) > 1.0e-30, along, 1.0e-30)
     column = wp.clamp(int(normal[(axis + 1) % 3] * scale + wp.static(0.5 * CUBE_EDGE)), 0, wp.static(CUBE_EDGE - 1))
     row = wp.clamp(int(normal[(axis + 2) % 3] * scale + wp.static(0.5 * CUBE_EDGE)), 0, wp.static(CUBE_EDGE - 1))
-    face = 2 * axis + wp.where(along < 0.0, 1, 0)
+    face = axis + wp.where(along < 0.0, 3, 0)
     return 1 + (face * wp.static(CUBE_EDGE) + row) * wp.static(CUBE_EDGE) + column
 
 
@@ -214,11 +228,12 @@ def upload_masks(order: int, device: wp.Device) -> wp.array:
     """The `MaskTable` of `order` bands on a device, as an array of one."""
     _, inside = pixel_places()
     directions = pixel_directions().astype(np.float32)
-    normals = wp.array(plane_normals().astype(np.float32), dtype=wp.vec3, device=device)
+    planes = plane_normals()
+    normals = wp.array(planes[: len(planes) // 2], dtype=wp.vec3, device=device)
     table = MaskTable()
     table.directions = wp.array(directions, dtype=wp.vec3, device=device)
     table.inside = wp.array(np.packbits(inside, bitorder="little").view("<u8"), dtype=wp.uint64, device=device)
-    table.planes = wp.zeros(1 + len(normals), dtype=mask, device=device)
+    table.planes = wp.zeros(1 + len(planes), dtype=mask, device=device)
     inputs = [normals, table.directions, table.inside]
     launch(_fill_planes, (1, len(normals)), inputs, [table.planes], device)
     # Functions about a direction (theta, phi) are turned by theta about y, then by phi about z; a turn about y is one
