@@ -10,6 +10,8 @@ from warp_psf.basis.visibility_mask import upload_masks
 from warp_psf.device import find_device
 from warp_psf.field.blockers import BlockerSet
 from warp_psf.shade.hemisphere import (
+    NOT_SEEN,
+    SEEN,
     bring_shape,
     integrate_masks,
     make_hemisphere,
@@ -39,14 +41,14 @@ def near(faces: np.ndarray, vertices: int, two_sided: bool) -> BlockerSet:
 
 
 def start(blockers: BlockerSet, points, normals, blocker_vertices, radius: float = 0.0, blocker_of=None):
-    """A state with all vertices needed; `blocker_of` is 0 for all by default."""
+    """A state with all vertices seen; `blocker_of` is 0 for all by default."""
     device = find_device("cpu")
     points, normals, blocker_vertices = (np.asarray(a, np.float32)[None] for a in (points, normals, blocker_vertices))
     if blocker_of is None:
         blocker_of = np.zeros(points.shape[1], np.int32)
     state = upload_blockers(blockers, blocker_of, radius, 1, device)
-    state.table.needed.fill_(1)
     bring_shape(state, points, normals, blocker_vertices, device)
+    state.table.progress.fill_(SEEN)
     return state
 
 
@@ -204,10 +206,10 @@ def test_each_vertex_skips_its_own_triangles():
         np.testing.assert_array_equal(mask, masks_of(start(far(left, len(corners), True), points, normals, corners))[0])
 
 
-def test_vertices_that_are_not_needed_keep_their_masks():
+def test_vertices_that_are_not_seen_have_no_masks():
     corners, faces = soup(20)
     state = start(far(faces, len(corners), True), np.zeros((3, 3)), directions(3), corners)
-    state.table.needed.assign(np.array([[1, 0, 1]], np.int32))
+    state.table.progress.assign(np.array([[SEEN, NOT_SEEN, SEEN]], np.int32))
     found = masks_of(state)
     assert found[0].any() and found[2].any() and not found[1].any()
 
@@ -259,10 +261,10 @@ def test_every_world_has_its_own_shape():
     device = find_device("cpu")
     blockers, of = far(faces, len(corners), True), np.zeros(3, np.int32)
     state = upload_blockers(blockers, of, 0.0, 2, device)
-    state.table.needed.fill_(1)
     points, normals = np.zeros((2, 3, 3), np.float32), np.tile(directions(3)[None], (2, 1, 1)).astype(np.float32)
     both = np.stack([corners, -corners]).astype(np.float32)
     bring_shape(state, points, normals, both, device)
+    state.table.progress.fill_(SEEN)
     masks = upload_masks(3, device)
     vec = make_hemisphere(3).vec
     transfer, visibility = (wp.zeros(7, dtype=vec, device=device) for _ in range(2))

@@ -63,7 +63,8 @@ class Entity:
 class Scene:
     """The unchanging part: shapes, entities, their textures, and the lights that move with them.
 
-    loose: the entity that stands for everything without a rigid shape, -1 for none.
+    loose: the entity that stands for tendons and added geoms, -1 for none.
+    deforming: the entities that deform, whose vertices move in every frame.
     """
 
     meshes: tuple[Mesh, ...]
@@ -71,6 +72,7 @@ class Scene:
     lights: tuple[Light, ...]
     textures: tuple[Texture, ...] = ()
     loose: int = -1
+    deforming: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,9 @@ def make_direct(order: int) -> SimpleNamespace:
         eye: wp.array(dtype=wp.vec3)  # (world), metres
         transfer: wp.array(dtype=vec)  # (transfer vertex), in the entity's frame
         self_visibility: wp.array(dtype=vec)  # (transfer vertex)
-        first_transfer: wp.array(dtype=wp.int32)  # (entity): -1 for convex bodies
+        first_transfer: wp.array2d(dtype=wp.int32)  # (world, entity): -1 for convex bodies
+        gloss: wp.array(dtype=vec)  # (gloss vertex): transfer through the lobe in which the eye is seen
+        first_gloss: wp.array2d(dtype=wp.int32)  # (world, entity): -1 where that is the product of both
         lobe: wp.array(dtype=profile)  # (entity): Phong lobe, coefficients of Legendre polynomials
 
     LightingTables = wp.array(dtype=Lighting)
@@ -60,6 +62,7 @@ def make_direct(order: int) -> SimpleNamespace:
         normal: wp.vec3
         mirrored: wp.vec3  # where a mirror there would send the eye's rays
         first_transfer: wp.int32  # of the entity's stored transfer; -1 where the closed form holds
+        first_gloss: wp.int32  # of the entity's stored gloss, -1 where there is none
         corners: wp.vec3i  # of the face
         uv: wp.vec2  # weights of the first two corners
 
@@ -80,7 +83,8 @@ def make_direct(order: int) -> SimpleNamespace:
         surface.normal = receivers.normal[world, receiver]
         surface.corners = geometry[0].faces[geometry[0].first_face[mesh] + receivers.face[world, receiver]]
         surface.uv = receivers.uv[world, receiver]
-        surface.first_transfer = lighting[0].first_transfer[entity]
+        surface.first_transfer = lighting[0].first_transfer[world, entity]
+        surface.first_gloss = lighting[0].first_gloss[world, entity]
         if surface.first_transfer >= 0:
             vertex = geometry[0].first_vertex[mesh]
             outward = poses[0].rotation[world, entity] * (
@@ -89,15 +93,16 @@ def make_direct(order: int) -> SimpleNamespace:
                 + (1.0 - surface.uv[0] - surface.uv[1]) * geometry[0].normals[vertex + surface.corners[2]]
             )
             if wp.dot(outward, surface.normal) < 0.0:
-                surface.first_transfer = -1  # the back of an open surface: what is stored is of its front
+                # The back of an open surface: what is stored is of its front.
+                surface.first_transfer = -1
+                surface.first_gloss = -1
         view = wp.normalize(lighting[0].eye[world] - surface.position)
         surface.mirrored = 2.0 * wp.dot(surface.normal, view) * surface.normal - view
         return surface
 
     @wp.func
-    def stored_at(stored: wp.array(dtype=vec), surface: Surface) -> vec:
-        """A vector stored per vertex, at the surface."""
-        start = surface.first_transfer
+    def stored_at(stored: wp.array(dtype=vec), start: int, surface: Surface) -> vec:
+        """A vector stored per vertex, those of the entity from `start` on, at the surface."""
         return (
             surface.uv[0] * stored[start + surface.corners[0]]
             + surface.uv[1] * stored[start + surface.corners[1]]
@@ -113,7 +118,7 @@ def make_direct(order: int) -> SimpleNamespace:
     ) -> values:
         """The clamped cosine, times what the body leaves of its own hemisphere."""
         if surface.first_transfer >= 0:
-            return kit.at_directions(stored_at(lighting[0].transfer, surface), rows)
+            return kit.at_directions(stored_at(lighting[0].transfer, surface.first_transfer, surface), rows)
         return kit.zonal_at_directions(wp.static(cosine_profile), surface.normal, o[0].quadrature)
 
     @wp.func
@@ -126,7 +131,9 @@ def make_direct(order: int) -> SimpleNamespace:
         """1 minus what the body itself blocks above the horizon."""
         open_share = values(1.0)
         if surface.first_transfer >= 0 and lighting[0].light_entity.shape[0] > 0:
-            open_share += kit.at_directions(stored_at(lighting[0].self_visibility, surface), rows)
+            open_share += kit.at_directions(
+                stored_at(lighting[0].self_visibility, surface.first_transfer, surface), rows
+            )
             open_share -= kit.cap_coverage(surface.normal, 1.0, o[0].quadrature)
         return open_share
 
@@ -228,8 +235,11 @@ def make_direct(order: int) -> SimpleNamespace:
         lobe = values()
         if wp.max(geometry[0].specular[entity]) > 0.0:
             # The transfer brings the cosine that the lobe is normalised for, and what the body hides from itself.
-            lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
-            lobe = wp.cw_mul(lobe, transfer)
+            if surface.first_gloss >= 0:
+                lobe = kit.at_directions(stored_at(lighting[0].gloss, surface.first_gloss, surface), rows)
+            else:
+                lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
+                lobe = wp.cw_mul(lobe, transfer)
             glossy = environment_light(world, wp.cw_mul(visible, lobe), lighting)
 
         open_share = open_to_self(surface, rows, lighting, o)
@@ -273,11 +283,16 @@ def legendre_series(zonal: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DirectState:
-    """The lighting tables of a scene."""
+    """The lighting tables of a scene.
+
+    rows: of each deforming entity the first rows of its transfer and of its gloss, -1 where it has none; its vertices'
+        rows follow, world by world.
+    """
 
     order: int
     table: Any  # make_direct(order).Lighting
     tables: wp.array  # (1): the table, as kernels take it
+    rows: dict[int, tuple[int, int]]
 
 
 def upload_lighting(
@@ -288,7 +303,7 @@ def upload_lighting(
     worlds: int,
     device: wp.Device,
 ) -> DirectState:
-    """The lighting tables of a scene.
+    """The lighting tables of a scene, with room for the transfer of its deforming entities.
 
     transfers: per mesh its (transfer, self-visibility), float32 [vertices, order^2] each, or None if it is convex.
     lights: (entity, radiance [3]) of each area light.
@@ -306,18 +321,31 @@ def upload_lighting(
     table.eye = wp.zeros(worlds, dtype=wp.vec3, device=device)
 
     stored = [pair for pair in transfers if pair is not None]
-    empty = np.zeros((0, order * order), np.float32)
-    table.transfer = wp.array(np.concatenate([empty, *(p[0] for p in stored)]), dtype=kit.vec, device=device)
-    table.self_visibility = wp.array(np.concatenate([empty, *(p[1] for p in stored)]), dtype=kit.vec, device=device)
     starts, total = [], 0
     for pair in transfers:
         starts.append(-1 if pair is None else total)
         total += 0 if pair is None else len(pair[0])
-    first = [starts[entity.mesh] for entity in scene.entities]
+    first = np.tile(np.array([starts[entity.mesh] for entity in scene.entities], np.int32), (worlds, 1))
+    first_gloss, glossy, rows = np.full_like(first, -1), 0, {}
+    for index in scene.deforming:
+        entity = scene.entities[index]
+        count = len(scene.meshes[entity.mesh].vertices)
+        has_gloss = entity.lobe.specular.max() > 0.0
+        rows[index] = total, glossy if has_gloss else -1
+        first[:, index] = total + count * np.arange(worlds)
+        total += count * worlds
+        if has_gloss:
+            first_gloss[:, index] = glossy + count * np.arange(worlds)
+            glossy += count * worlds
+    deforming = np.zeros((total - sum(len(pair[0]) for pair in stored), order * order), np.float32)
+    table.transfer = wp.array(np.concatenate([*(p[0] for p in stored), deforming]), dtype=kit.vec, device=device)
+    table.self_visibility = wp.array(np.concatenate([*(p[1] for p in stored), deforming]), dtype=kit.vec, device=device)
+    table.gloss = wp.zeros(glossy, dtype=kit.vec, device=device)
     table.first_transfer = wp.array(first, dtype=wp.int32, device=device)
+    table.first_gloss = wp.array(first_gloss, dtype=wp.int32, device=device)
     lobes = [legendre_series(sh.phong_lobe(entity.lobe.exponent, order + 1)) for entity in scene.entities]
     table.lobe = wp.array(np.array(lobes, np.float32).reshape(-1, order + 1), dtype=kit.profile, device=device)
-    return DirectState(order, table, upload_tables([table], kit.Lighting, device))
+    return DirectState(order, table, upload_tables([table], kit.Lighting, device), rows)
 
 
 def write_environment(state: DirectState, coefficients: np.ndarray) -> None:

@@ -24,6 +24,8 @@ from warp_psf.basis.visibility_mask import (
 )
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.blockers import BlockerSet
+from warp_psf.scene.geometry import DeviceScene, GeometryTables
+from warp_psf.scene.receiver import ReceiverTable
 
 # The origin of a mask leaves the surface by this share of the body's radius, as in the bake of rigid bodies: faces that
 # meet at a vertex then hide what they should of its valleys.
@@ -32,6 +34,9 @@ ORIGIN_OFFSET = 1.0e-3
 # thousandth of a pixel, and its planes would be those of rounding.
 EDGE_ON = 2.0e-6
 
+# What has become of a vertex since the body moved: no pixel needs it, one does, and its transfer is known.
+NOT_SEEN, SEEN, DONE = 0, 1, 2
+
 
 @wp.struct
 class BlockerTable:
@@ -39,7 +44,7 @@ class BlockerTable:
 
     position: wp.array2d(dtype=wp.vec3)  # (world, vertex): of those seen, metres, in the world
     normal: wp.array2d(dtype=wp.vec3)  # (world, vertex)
-    needed: wp.array2d(dtype=wp.int32)  # (world, vertex): 1 where its mask is to be found
+    progress: wp.array2d(dtype=wp.int32)  # (world, vertex): NOT_SEEN, SEEN or DONE
     blocker_of: wp.array(dtype=wp.int32)  # (vertex)
     blocker: wp.array2d(dtype=wp.vec3)  # (world, blocker vertex), metres, in the world
     faces: wp.array(dtype=wp.vec3i)  # (triangle)
@@ -66,6 +71,19 @@ class Horizon:
     tangent: wp.vec3
     bitangent: wp.vec3
     normal: wp.vec3
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _mark_seen(first: int, pixels: ReceiverTable, entity: int, geometry: GeometryTables, blockers: BlockerTables):
+    world, slot = wp.tid()
+    slot += first
+    if pixels.entity[world, slot] != entity:
+        return
+    corners = geometry[0].faces[geometry[0].first_face[geometry[0].entity_mesh[entity]] + pixels.face[world, slot]]
+    for corner in range(3):
+        # Several pixels may write the same.
+        if blockers[0].progress[world, corners[corner]] == wp.static(NOT_SEEN):
+            blockers[0].progress[world, corners[corner]] = wp.static(SEEN)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -162,7 +180,7 @@ def is_above(world: int, cluster: int, horizon: Horizon, blockers: BlockerTables
 def _rasterise(first: int, blockers: BlockerTables, masks: MaskTables):
     world, vertex = wp.tid()
     vertex += first
-    if blockers[0].needed[world, vertex] == 0:
+    if blockers[0].progress[world, vertex] != wp.static(SEEN):
         return
     horizon = horizon_of(world, vertex, blockers)
     place = blockers[0].blocker_of[vertex]
@@ -202,8 +220,9 @@ def make_hemisphere(order: int) -> SimpleNamespace:
     ):
         world, vertex = wp.tid()
         vertex += first
-        if blockers[0].needed[world, vertex] == 0:
+        if blockers[0].progress[world, vertex] != wp.static(SEEN):
             return
+        blockers[0].progress[world, vertex] = wp.static(DONE)
         normal = blockers[0].normal[world, vertex]
         covered = blockers[0].masks[world, vertex]
         both = kit.open_transfer(covered, normal, masks)
@@ -211,7 +230,27 @@ def make_hemisphere(order: int) -> SimpleNamespace:
         transfer_out[row] = both[0]
         visibility_out[row] = both[1]
 
-    return SimpleNamespace(vec=vec, integrate=integrate)
+    @wp.kernel(enable_backward=False, module="unique")
+    def integrate_lobe(
+        first: int,
+        blockers: BlockerTables,
+        masks: MaskTables,
+        eye: wp.array(dtype=wp.vec3),  # (world), metres
+        exponent: float,
+        first_row: int,
+        gloss_out: wp.array(dtype=vec),  # (row)
+    ):
+        world, vertex = wp.tid()
+        vertex += first
+        if blockers[0].progress[world, vertex] != wp.static(DONE):
+            return
+        normal = blockers[0].normal[world, vertex]
+        view = wp.normalize(eye[world] - blockers[0].position[world, vertex])
+        mirrored = 2.0 * wp.dot(normal, view) * normal - view
+        row = first_row + world * blockers[0].position.shape[1] + vertex
+        gloss_out[row] = kit.open_lobe(blockers[0].masks[world, vertex], normal, mirrored, exponent, masks)
+
+    return SimpleNamespace(vec=vec, integrate=integrate, integrate_lobe=integrate_lobe)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +272,7 @@ def upload_blockers(
     shape = (worlds, len(blocker_of))
     table.position = wp.zeros(shape, dtype=wp.vec3, device=device)
     table.normal = wp.zeros(shape, dtype=wp.vec3, device=device)
-    table.needed = wp.zeros(shape, dtype=wp.int32, device=device)
+    table.progress = wp.zeros(shape, dtype=wp.int32, device=device)
     table.blocker_of = wp.array(blocker_of, dtype=wp.int32, device=device)
     table.blocker = wp.zeros((worlds, len(blockers.first_near) - 1), dtype=wp.vec3, device=device)
     table.faces = wp.array(blockers.faces, dtype=wp.vec3i, device=device)
@@ -253,15 +292,26 @@ def upload_blockers(
 def bring_shape(
     state: HemisphereState, vertices: np.ndarray, normals: np.ndarray, blocker_vertices: np.ndarray, device: wp.Device
 ) -> None:
-    """Brings the shape of a frame to the device: float32 [worlds, V, 3] twice, and [worlds, B, 3]."""
+    """Brings another shape to the device, of which no transfer is known yet.
+
+    vertices, normals: float32 [worlds, V, 3]. blocker_vertices: float32 [worlds, B, 3].
+    """
     state.table.position.assign(vertices)
     state.table.normal.assign(normals)
     state.table.blocker.assign(blocker_vertices)
+    state.table.progress.fill_(NOT_SEEN)
     launch(_bound_clusters, state.table.lower.shape, [state.tables], [], device)
 
 
+def mark_seen(
+    state: HemisphereState, entity: int, pixels: ReceiverTable, scene: DeviceScene, device: wp.Device
+) -> None:
+    """Asks for the transfer of the vertices of an entity whose faces a pixel sees."""
+    launch(_mark_seen, pixels.entity.shape, [pixels, entity, scene.geometry, state.tables], [], device)
+
+
 def rasterise_masks(state: HemisphereState, masks: wp.array, device: wp.Device) -> None:
-    """Finds the masks of the vertices that are needed."""
+    """Finds the masks of the vertices that are seen."""
     launch(_rasterise, state.table.position.shape, [state.tables, masks], [], device)
 
 
@@ -274,8 +324,24 @@ def integrate_masks(
     visibility: wp.array,
     device: wp.Device,
 ) -> None:
-    """Writes transfer (visibility times the clamped cosine) and visibility of the vertices that are needed, on `order`
-    bands, into rows from `first_row` on, world by world."""
+    """Writes transfer (visibility times the clamped cosine) and visibility of the vertices that are seen, on `order`
+    bands, into rows from `first_row` on, world by world. They are kept for as long as the body is still."""
     inputs = [state.tables, masks, first_row]
     outputs = [transfer, visibility]
     launch(make_hemisphere(order).integrate, state.table.position.shape, inputs, outputs, device)
+
+
+def integrate_lobes(
+    state: HemisphereState,
+    masks: wp.array,
+    order: int,
+    eye: wp.array,
+    exponent: float,
+    first_row: int,
+    gloss: wp.array,
+    device: wp.Device,
+) -> None:
+    """Writes visibility times the clamped cosine times the Phong lobe in which the eyes, vec3 (worlds), are seen
+    reflected, of all vertices whose masks are known, as `integrate_masks` does."""
+    inputs = [state.tables, masks, eye, exponent, first_row]
+    launch(make_hemisphere(order).integrate_lobe, state.table.position.shape, inputs, [gloss], device)

@@ -68,7 +68,7 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         wide_rows: wp.array(dtype=half_values),
     ) -> wide:
         """Onto SH: about the axes of a body that shadows itself, as its stored transfer is; else about the world's."""
-        if lighting[0].first_transfer[entity] >= 0:
+        if lighting[0].first_transfer[world, entity] >= 0:
             return widen(kit.project(weighted, o[0].rows[world, entity]))
         return project_wide(weighted, wide_rows)
 
@@ -171,9 +171,9 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
     def response_of(world: int, surface: Surface, poses: PoseTables, lighting: LightingTables) -> wide:
         """What incident light is to be multiplied with to give irradiance."""
         if surface.first_transfer >= 0:
-            return widen(kit.stored_at(lighting[0].transfer, surface))
+            return widen(kit.stored_at(lighting[0].transfer, surface.first_transfer, surface))
         n = surface.normal
-        if lighting[0].first_transfer[surface.entity] >= 0:
+        if lighting[0].first_transfer[world, surface.entity] >= 0:
             n = wp.transpose(poses[0].rotation[world, surface.entity]) * n
         return wp.cw_mul(wp.static(cosine), evaluate_wide(n))
 
