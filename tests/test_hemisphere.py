@@ -192,18 +192,23 @@ def test_triangles_that_share_an_edge_leave_no_gap():
 
 
 def test_each_vertex_skips_its_own_triangles():
-    corners, faces = soup(30)
+    # Each is seen by itself: one per cell of a grid overhead.
+    x, y = np.meshgrid(np.linspace(-0.75, 0.75, 6), np.linspace(-0.75, 0.75, 6))
+    corners = np.stack([x.ravel(), y.ravel(), np.ones(36)], axis=1)[:, None] + [[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0]]
+    corners, faces = corners.reshape(-1, 3), np.arange(108).reshape(-1, 3)
     points, normals = np.zeros((2, 3)), np.tile([[0.0, 0.0, 1.0]], (2, 1))
-    first_skip = np.zeros(len(corners) + 1, np.int32)
-    first_skip[1:] = 4
-    first_skip[2:] = 6
-    skip = np.array([0, 7, 8, 29, 3, 11], np.int32)  # of vertex 0 the first four, of vertex 1 the rest
-    whole = far(faces, len(corners), True, clusters=6)
-    blockers = BlockerSet(**(vars(whole) | {"first_skip": first_skip, "skip": skip}))
-    found = masks_of(start(blockers, points, normals, corners, blocker_of=np.array([0, 1], np.int32)))
-    for mask, rows in zip(found, (skip[:4], skip[4:]), strict=True):
-        left = np.delete(faces, rows, axis=0)
-        np.testing.assert_array_equal(mask, masks_of(start(far(left, len(corners), True), points, normals, corners))[0])
+    first_skip = np.full(len(corners) + 1, 9, np.int32)
+    first_skip[:2] = 0, 6
+    skip = np.array([0, 7, 8, 17, 18, 35, 5, 6, 29], np.int32)  # of vertex 0 the first six, of vertex 1 the rest
+    for clusters in (1, 2, 6):
+        blockers = BlockerSet(
+            **(vars(far(faces, len(corners), True, clusters)) | {"first_skip": first_skip, "skip": skip})
+        )
+        found = masks_of(start(blockers, points, normals, corners, blocker_of=np.array([0, 1], np.int32)))
+        for mask, rows in zip(found, (skip[:6], skip[6:]), strict=True):
+            left = np.delete(faces, rows, axis=0)
+            np.testing.assert_array_equal(mask, hidden_by(left, corners, points[:1], normals[:1])[0])
+            assert mask.sum() < hidden_by(faces, corners, points[:1], normals[:1]).sum()
 
 
 def test_vertices_that_are_not_seen_have_no_masks():

@@ -85,10 +85,15 @@ def test_planes_hold_what_lies_above_them():
 def test_a_normal_finds_the_nearest_plane():
     device = find_device("cpu")
 
+    @wp.func_native(
+        "int found; " + visibility_mask.plane_snippet(*(f"n[{k}]" for k in range(3)), "found") + "return found;"
+    )
+    def plane_of(n: wp.vec3) -> int: ...
+
     @wp.kernel(enable_backward=False, module="unique")
     def kernel(first: int, normals: wp.array(dtype=wp.vec3), planes_out: wp.array(dtype=wp.int32)):
         _, index = wp.tid()
-        planes_out[first + index] = visibility_mask.plane_of(normals[first + index])
+        planes_out[first + index] = plane_of(normals[first + index])
 
     corners = np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3)
     corners = corners[corners.any(axis=1)]

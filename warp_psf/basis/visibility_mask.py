@@ -153,57 +153,53 @@ def _fill_planes(
     planes_out[1 + plane + normals.shape[0]] = find_rest(above, inside)
 
 
-@wp.func
-def plane_of(normal: wp.vec3) -> int:
-    """Where the table has the plane nearest to that with this normal, which need not be of unit length."""
-    x = wp.abs(normal[0])
-    y = wp.abs(normal[1])
-    z = wp.abs(normal[2])
-    axis = wp.where(z > wp.max(x, y), 2, wp.where(y > x, 1, 0))
-    along = normal[axis]
-    # The same cell for a plane and its opposite.
-    scale = wp.static(0.5 * CUBE_EDGE) / wp.where(wp.abs(along) > 1.0e-30, along, 1.0e-30)
-    column = wp.clamp(int(normal[(axis + 1) % 3] * scale + wp.static(0.5 * CUBE_EDGE)), 0, wp.static(CUBE_EDGE - 1))
-    row = wp.clamp(int(normal[(axis + 2) % 3] * scale + wp.static(0.5 * CUBE_EDGE)), 0, wp.static(CUBE_EDGE - 1))
-    face = axis + wp.where(along < 0.0, 3, 0)
-    return 1 + (face * wp.static(CUBE_EDGE) + row) * wp.static(CUBE_EDGE) + column
+# Triangles are drawn in batches: their planes are found side by side, and fetched while others are drawn. The table is
+# larger than a core's cache; waiting for one plane after the other would take two thirds of the time.
+BATCH = 16
+batch = wp.types.matrix((3, BATCH), wp.int32)
 
 
-@wp.func_native(f"""
-    wp::vec_t<{WORDS}, uint64_t> result;
-    const uint64_t* a = &table.data[planes[0]][0];
-    const uint64_t* b = &table.data[planes[1]][0];
-    const uint64_t* c = &table.data[planes[2]][0];
-    for (int word = 0; word < {WORDS}; ++word) result[word] = covered[word] | (a[word] & b[word] & c[word]);
-    return result;
-""")
-def cover(covered: mask, table: wp.array(dtype=mask), planes: wp.vec3i) -> mask:
-    """A mask together with what lies above three planes of the table."""
+def plane_snippet(x: str, y: str, z: str, plane: str) -> str:
+    """C++ that sets `plane` to where the table has the plane nearest to that with the normal x, y, z, of any length.
 
-
-# The table is larger than a core's cache. Triangles wait in a queue while their planes are on the way, without which
-# fetching takes two thirds of the time.
-QUEUE = 4
-queue = wp.types.matrix((QUEUE, 3), wp.int32)
+    Without branches, so that a compiler can do it for many normals side by side.
+    """
+    half, cells = f"{0.5 * CUBE_EDGE}f", CUBE_EDGE
+    return f"""{{
+        const float to_x = fabsf({x}), to_y = fabsf({y}), to_z = fabsf({z});
+        const bool is_z = to_z > to_x && to_z > to_y, is_y = !is_z && to_y > to_x;
+        const float along = is_z ? {z} : is_y ? {y} : {x};
+        const float u = is_z ? {x} : is_y ? {z} : {y}, v = is_z ? {y} : is_y ? {x} : {z};
+        // The same cell for a plane and its opposite.
+        const float scale = {half} / (fabsf(along) > 1e-30f ? along : 1e-30f);
+        int column = (int)(u * scale + {half}), row = (int)(v * scale + {half});
+        column = column < 0 ? 0 : column > {cells - 1} ? {cells - 1} : column;
+        row = row < 0 ? 0 : row > {cells - 1} ? {cells - 1} : row;
+        const int face = (is_z ? 2 : is_y ? 1 : 0) + (along < 0.0f ? 3 : 0);
+        {plane} = 1 + (face * {cells} + row) * {cells} + column;
+    }}"""
 
 
 @wp.func_native(f"""
     #if !defined(__CUDA_ARCH__)
-    for (int which = 0; which < 3; ++which) {{
-        const char* plane = (const char*)&table.data[planes[which]];
+    for (int place = 0; place < {3 * BATCH}; ++place) {{
+        const char* plane = (const char*)&table.data[(&planes.data[0][0])[place]];
         __builtin_prefetch(plane);
         __builtin_prefetch(plane + 64);
     }}
     #endif
-    wp::mat_t<{QUEUE}, 3, int> moved;
-    for (int which = 0; which < 3; ++which) {{
-        for (int place = 1; place < {QUEUE}; ++place) moved.data[place - 1][which] = waiting.data[place][which];
-        moved.data[{QUEUE - 1}][which] = planes[which];
+    wp::vec_t<{WORDS}, uint64_t> result = covered;
+    for (int place = 0; place < {BATCH}; ++place) {{
+        if (planes.data[0][place] == 0) continue;
+        const uint64_t* a = &table.data[planes.data[0][place]][0];
+        const uint64_t* b = &table.data[planes.data[1][place]][0];
+        const uint64_t* c = &table.data[planes.data[2][place]][0];
+        for (int word = 0; word < {WORDS}; ++word) result[word] |= a[word] & b[word] & c[word];
     }}
-    return moved;
+    return result;
 """)
-def queue_up(waiting: queue, table: wp.array(dtype=mask), planes: wp.vec3i) -> queue:
-    """The queue without its first triangle, with another at its end whose planes are sent for."""
+def cover(covered: mask, table: wp.array(dtype=mask), planes: batch) -> mask:
+    """A mask together with a batch of triangles: what lies above three planes of the table each; 0 for none."""
 
 
 @cache

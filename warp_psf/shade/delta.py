@@ -122,10 +122,7 @@ def share_passed(
                 way = inverse * toward
                 if may_hit(geometry, entity, start, way, 1.0):
                     mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
-                    root = int(-1)
-                    if geometry[0].shadow_group[entity] >= 0:
-                        root = wp.mesh_get_group_root(mesh, geometry[0].shadow_group[entity])
-                    if wp.mesh_query_ray_anyhit(mesh, start, way, 1.0, root):
+                    if wp.mesh_query_ray_anyhit(mesh, start, way, 1.0):
                         passed *= 1.0 - opacity[entity]
                         if passed <= 0.0:
                             return 0.0
@@ -271,13 +268,11 @@ def make_delta_lights(scene: Scene, worlds: int, far: float, device: wp.Device) 
     table.reach = wp.zeros(shape, dtype=wp.float32, device=device)
     table.radius = wp.zeros(shape, dtype=wp.float32, device=device)
     table.casts = wp.zeros(shape, dtype=wp.bool, device=device)
-    opacity = [entity.opacity if entity.casts else 0.0 for entity in scene.entities]
+    opacity = [
+        entity.opacity if entity.casts or index in scene.deforming else 0.0
+        for index, entity in enumerate(scene.entities)
+    ]
     return DeltaState(table, far, wp.array(opacity, dtype=wp.float32, device=device))
-
-
-def write_loose_opacity(state: DeltaState, entity: int, casts: bool) -> None:
-    """Whether the loose entity casts shadows in this frame: it does when it has a deforming body."""
-    state.opacity[entity : entity + 1].fill_(1.0 if casts else 0.0)
 
 
 def write_delta_lights(state: DeltaState, worlds: Sequence[Sequence[DeltaLight]]) -> None:

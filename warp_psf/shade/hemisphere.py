@@ -12,16 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_psf.basis.visibility_mask import (
-    QUEUE,
-    MaskTables,
-    cover,
-    make_masks,
-    mask,
-    plane_of,
-    queue,
-    queue_up,
-)
+from warp_psf.basis.visibility_mask import BATCH, MaskTables, batch, cover, make_masks, mask, plane_snippet
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.blockers import BlockerSet
 from warp_psf.scene.geometry import DeviceScene, GeometryTables
@@ -48,6 +39,7 @@ class BlockerTable:
     blocker_of: wp.array(dtype=wp.int32)  # (vertex)
     blocker: wp.array2d(dtype=wp.vec3)  # (world, blocker vertex), metres, in the world
     faces: wp.array(dtype=wp.vec3i)  # (triangle)
+    far: wp.array(dtype=wp.int32)  # (coarse triangle): all of them
     first_of_cluster: wp.array(dtype=wp.int32)  # (cluster + 1)
     lower: wp.array2d(dtype=wp.vec3)  # (world, cluster): corners of its box, metres
     upper: wp.array2d(dtype=wp.vec3)  # (world, cluster)
@@ -116,54 +108,72 @@ def horizon_of(world: int, vertex: int, blockers: BlockerTables) -> Horizon:
     return horizon
 
 
-@wp.func
-def plane_above(normal: wp.vec3, horizon: Horizon) -> int:
-    """The table's plane through the origin that has this normal, in the world."""
-    return plane_of(
-        wp.vec3(wp.dot(horizon.tangent, normal), wp.dot(horizon.bitangent, normal), wp.dot(horizon.normal, normal))
+def _planes_snippet() -> str:
+    """C++: the corners of a batch fetched one by one, then all of the batch side by side."""
+    edges = [("a", "b", 0), ("b", "c", 1), ("c", "a", 2)]
+    crosses = "".join(
+        f"""
+        const float x_{k} = side * ({p}y * {q}z - {p}z * {q}y), y_{k} = side * ({p}z * {q}x - {p}x * {q}z);
+        const float z_{k} = side * ({p}x * {q}y - {p}y * {q}x);
+        int plane_{k};
+        {plane_snippet(f"x_{k}", f"y_{k}", f"z_{k}", f"plane_{k}")}
+        found.data[{k}][lane] = hides ? plane_{k} : 0;
+        """
+        for p, q, k in edges
     )
-
-
-@wp.func
-def planes_of(world: int, triangle: int, horizon: Horizon, blockers: BlockerTables) -> wp.vec3i:
-    """The planes above which a triangle lies as it is seen from the origin; 0 where it hides nothing."""
-    corners = blockers[0].faces[triangle]
-    a = blockers[0].blocker[world, corners[0]] - horizon.origin
-    b = blockers[0].blocker[world, corners[1]] - horizon.origin
-    c = blockers[0].blocker[world, corners[2]] - horizon.origin
-    highest = wp.max(wp.max(wp.dot(horizon.normal, a), wp.dot(horizon.normal, b)), wp.dot(horizon.normal, c))
-    if highest <= 0.0:
-        return wp.vec3i()
-    normal = wp.cross(a, b)
-    volume = wp.dot(normal, c)
-    if volume > 0.0 and not blockers[0].two_sided:
-        return wp.vec3i()  # seen from behind: the front of the body hides as much
-    if volume * volume <= wp.static(EDGE_ON**2) * wp.length_sq(a) * wp.length_sq(b) * wp.length_sq(c):
-        return wp.vec3i()
-    side = wp.where(volume > 0.0, 1.0, -1.0)
-    return wp.vec3i(
-        plane_above(side * normal, horizon),
-        plane_above(side * wp.cross(b, c), horizon),
-        plane_above(side * wp.cross(c, a), horizon),
+    corners = "".join(
+        f"""
+        const float {p}u = corners[{3 * k}][lane], {p}v = corners[{3 * k + 1}][lane], {p}w = corners[{3 * k + 2}][lane];
+        const float {p}x = t[0] * {p}u + t[1] * {p}v + t[2] * {p}w, {p}y = s[0] * {p}u + s[1] * {p}v + s[2] * {p}w;
+        const float {p}z = n[0] * {p}u + n[1] * {p}v + n[2] * {p}w;
+        const float {p}{p} = {p}x * {p}x + {p}y * {p}y + {p}z * {p}z;
+        """
+        for k, p in enumerate("abc")
     )
+    return f"""
+    const auto& table = blockers.data[0];
+    const wp::vec3* places = table.blocker.data + world * table.blocker.shape[1];
+    const wp::vec3 o = horizon.origin, t = horizon.tangent, s = horizon.bitangent, n = horizon.normal;
+    float corners[9][{BATCH}];
+    bool drawn[{BATCH}];
+    for (int lane = 0; lane < {BATCH}; ++lane) {{
+        drawn[lane] = lane < count && !(skipped >> lane & 1u);
+        const int triangle = list.data[lane < count ? first + lane : first];
+        for (int corner = 0; corner < 3; ++corner)
+            for (int axis = 0; axis < 3; ++axis)
+                corners[3 * corner + axis][lane] = places[table.faces.data[triangle][corner]][axis] - o[axis];
+    }}
+    const bool two_sided = table.two_sided;
+    wp::mat_t<3, {BATCH}, int> found;
+    for (int lane = 0; lane < {BATCH}; ++lane) {{
+        {corners}
+        const float volume = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx);
+        const float side = volume > 0.0f ? 1.0f : -1.0f;
+        const bool faces = two_sided | (volume < 0.0f);
+        const bool spans = volume * volume > {EDGE_ON**2:.9e}f * aa * bb * cc;
+        const bool hides = drawn[lane] & ((az > 0.0f) | (bz > 0.0f) | (cz > 0.0f)) & faces & spans;
+        {crosses}
+    }}
+    return found;
+    """
 
 
-@wp.func
-def draw(
-    covered: mask,
-    waiting: queue,
+@wp.func_native(_planes_snippet())
+def find_planes(
     world: int,
-    triangle: int,
+    first: int,
+    count: int,
+    skipped: wp.uint32,
+    list: wp.array(dtype=wp.int32),
     horizon: Horizon,
     blockers: BlockerTables,
-    masks: MaskTables,
-):
-    """Sends a triangle into the queue, and draws the first one that waits there."""
-    # What lies above three planes is the triangle's image, wherever the horizon cuts it.
-    planes = planes_of(world, triangle, horizon, blockers)
-    if planes[0] == 0:
-        return covered, waiting
-    return cover(covered, masks[0].planes, waiting[0]), queue_up(waiting, masks[0].planes, planes)
+) -> batch:
+    """The planes above which triangles lie as they are seen from the origin; zeros for those that hide nothing.
+
+    They are the `count` triangles from `first` on in a list, at most a batch of them, less those whose bits are set in
+    `skipped`. Nothing is hidden by triangles below the horizon, by those seen edge-on, and by the backs of a closed
+    surface, whose front hides as much. What lies above three planes is the image, wherever the horizon cuts it.
+    """
 
 
 @wp.func
@@ -185,21 +195,24 @@ def _rasterise(first: int, blockers: BlockerTables, masks: MaskTables):
     horizon = horizon_of(world, vertex, blockers)
     place = blockers[0].blocker_of[vertex]
     covered = mask()
-    waiting = queue()
-    for index in range(blockers[0].first_near[place], blockers[0].first_near[place + 1]):
-        covered, waiting = draw(covered, waiting, world, blockers[0].near[index], horizon, blockers, masks)
+    for index in range(blockers[0].first_near[place], blockers[0].first_near[place + 1], wp.static(BATCH)):
+        count = blockers[0].first_near[place + 1] - index
+        planes = find_planes(world, index, count, wp.uint32(0), blockers[0].near, horizon, blockers)
+        covered = cover(covered, masks[0].planes, planes)
     skip = int(blockers[0].first_skip[place])
     last_skip = blockers[0].first_skip[place + 1]
     for cluster in range(blockers[0].first_of_cluster.shape[0] - 1):
         if is_above(world, cluster, horizon, blockers):
-            for triangle in range(blockers[0].first_of_cluster[cluster], blockers[0].first_of_cluster[cluster + 1]):
+            end = blockers[0].first_of_cluster[cluster + 1]
+            for index in range(blockers[0].first_of_cluster[cluster], end, wp.static(BATCH)):
                 # Those that are skipped are in ascending order, as triangles are.
-                while skip < last_skip and blockers[0].skip[skip] < triangle:
+                skipped = wp.uint32(0)
+                while skip < last_skip and blockers[0].skip[skip] < wp.min(index + wp.static(BATCH), end):
+                    if blockers[0].skip[skip] >= index:
+                        skipped |= wp.uint32(1) << wp.uint32(blockers[0].skip[skip] - index)
                     skip += 1
-                if skip == last_skip or blockers[0].skip[skip] != triangle:
-                    covered, waiting = draw(covered, waiting, world, triangle, horizon, blockers, masks)
-    for position in range(wp.static(QUEUE)):
-        covered = cover(covered, masks[0].planes, waiting[position])
+                planes = find_planes(world, index, end - index, skipped, blockers[0].far, horizon, blockers)
+                covered = cover(covered, masks[0].planes, planes)
     blockers[0].masks[world, vertex] = covered
 
 
@@ -281,6 +294,7 @@ def upload_blockers(
     table.upper = wp.zeros((worlds, clusters), dtype=wp.vec3, device=device)
     for name in ("first_of_cluster", "first_near", "near", "first_skip"):
         setattr(table, name, wp.array(getattr(blockers, name), dtype=wp.int32, device=device))
+    table.far = wp.array(np.arange(blockers.first_of_cluster[-1]), dtype=wp.int32, device=device)
     # A kernel may read, but not use, what stands behind the last one.
     table.skip = wp.array(np.append(blockers.skip, -1), dtype=wp.int32, device=device)
     table.two_sided = blockers.two_sided

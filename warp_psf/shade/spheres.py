@@ -4,6 +4,7 @@ Far from a body a few spheres stand for all, near it each stands for itself. The
 added at each receiver, with what a log shadow field has left.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -14,8 +15,9 @@ import warp as wp
 from warp_psf.basis.sh_exp import make_sh_exp
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.spheres import SphereSet, SphereTable, SphereTables, place_nodes
-from warp_psf.scene.loose import DeformingShape, Loose
+from warp_psf.scene.deforming import Deformed
 from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.scene import Scene
 from warp_psf.shade.fades import SMALLEST_SHARE, Light, horizon_fade, size_fade, sphere_nearness
 
 # Receivers of a cluster, which share a cut: neighbours in a row of pixels, or on a body.
@@ -26,9 +28,6 @@ CUT_SINE = 0.15
 # Spheres in a cut; where more would be, coarser ones stand for them.
 MOST_IN_CUT = 256
 COARSER = 1.5
-# A body's own sphere takes no light from a receiver inside of it, which by the fit lies on the surface; it fades in
-# over this share of its radius outside.
-SELF_FADE = 0.5
 
 
 @wp.struct
@@ -50,8 +49,11 @@ def _choose_cuts(first: int, receivers: ReceiverTable, spheres: SphereTables, cu
     end = wp.min(start + wp.static(CLUSTER), receivers.entity.shape[1])
     lower = wp.vec3(1.0e30, 1.0e30, 1.0e30)
     upper = -lower
+    own = int(-1)  # the entity of all receivers, -2 where they are of several
     for receiver in range(start, end):
-        if receivers.entity[world, receiver] >= 0:
+        entity = receivers.entity[world, receiver]
+        if entity >= 0:
+            own = wp.where(own == -1 or own == entity, entity, -2)
             lower = wp.min(lower, receivers.position[world, receiver])
             upper = wp.max(upper, receivers.position[world, receiver])
     count = int(0)
@@ -70,7 +72,7 @@ def _choose_cuts(first: int, receivers: ReceiverTable, spheres: SphereTables, cu
                 radius = spheres[0].radius[world, node]
                 away = wp.max(wp.length(spheres[0].center[world, node] - middle) - reach, 0.0)
                 small = spheres[0].root[node] == node and radius * radius < wp.static(SMALLEST_SHARE) * away * away
-                if small or spheres[0].weight[world, node] <= 0.0:
+                if small or spheres[0].entity[node] == own or spheres[0].weight[world, node] <= 0.0:
                     node += 2 * leaves - 1
                 elif leaves == 1 or radius <= largest * away:
                     # Where even the roots are too many, those behind are left out.
@@ -113,9 +115,8 @@ def make_spheres(order: int) -> SimpleNamespace:
         root = spheres[0].root[node]
         weight = size_fade(spheres[0].radius[world, root], wp.length_sq(spheres[0].center[world, root] - p))
         weight *= horizon_fade(wp.dot(n, offset), radius)
-        if spheres[0].entity[node] == own:
-            weight *= wp.clamp((distance - radius) / (wp.static(SELF_FADE) * radius), 0.0, 1.0)
-        if weight <= 0.0:
+        # What hides a body from itself is found by other means.
+        if weight <= 0.0 or spheres[0].entity[node] == own:
             return logarithms
         # Spheres behind one another share what they take. One that takes up much of the view hides those behind it
         # by itself.
@@ -133,48 +134,51 @@ def make_spheres(order: int) -> SimpleNamespace:
 
 @dataclass(frozen=True, eq=False)
 class SphereState:
-    """The sphere sets of a scene's bodies without a rigid shape.
+    """The sphere sets of a scene's deforming bodies.
 
-    sets: per deforming shape of the loose entity.
+    sets: of each, in the order of `Scene.deforming`; None for one that casts no shadows.
+    opacity: of each, in (0, 1].
     """
 
-    shapes: tuple[DeformingShape, ...]
-    sets: tuple[SphereSet, ...]
+    sets: tuple[SphereSet | None, ...]
+    opacity: tuple[float, ...]
     tables: wp.array  # (1): of SphereTable
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has spheres."""
+        return all(spheres is None for spheres in self.sets)
 
-def upload_spheres(
-    shapes: tuple[DeformingShape, ...], sets: tuple[SphereSet, ...], entity: int, worlds: int, device: wp.Device
-) -> SphereState:
-    """Room for the nodes of the sphere sets of shapes, all of which belong to one entity."""
-    leaves = np.concatenate([np.zeros(0, np.int32), *(spheres.leaves for spheres in sets)])
-    nodes = np.array([len(spheres.leaves) for spheres in sets], np.int64)
-    root = np.repeat(np.cumsum(nodes) - nodes, nodes)
+
+def upload_spheres(scene: Scene, sets: Sequence[SphereSet | None], worlds: int, device: wp.Device) -> SphereState:
+    """Room for the nodes of the sphere sets of a scene's deforming bodies; `sets` as in `SphereState`."""
+    present = [(entity, spheres) for entity, spheres in zip(scene.deforming, sets, strict=True) if spheres is not None]
+    leaves = np.concatenate([np.zeros(0, np.int32), *(spheres.leaves for _, spheres in present)])
+    nodes = np.array([len(spheres.leaves) for _, spheres in present], np.int64)
     table = SphereTable()
     table.center = wp.zeros((worlds, len(leaves)), dtype=wp.vec3, device=device)
     table.radius = wp.zeros((worlds, len(leaves)), dtype=wp.float32, device=device)
     table.weight = wp.zeros((worlds, len(leaves)), dtype=wp.float32, device=device)
     table.leaves = wp.array(leaves, dtype=wp.int32, device=device)
-    table.root = wp.array(root, dtype=wp.int32, device=device)
-    table.entity = wp.full(len(leaves), entity, dtype=wp.int32, device=device)
-    return SphereState(shapes, sets, upload_tables([table], SphereTable, device))
+    table.root = wp.array(np.repeat(np.cumsum(nodes) - nodes, nodes), dtype=wp.int32, device=device)
+    entities = np.array([entity for entity, _ in present], np.int32)
+    table.entity = wp.array(np.repeat(entities, nodes), dtype=wp.int32, device=device)
+    opacity = tuple(scene.entities[entity].opacity for entity in scene.deforming)
+    return SphereState(tuple(sets), opacity, upload_tables([table], SphereTable, device))
 
 
-def carry_spheres(state: SphereState, loose: Loose | None) -> None:
-    """Brings the spheres to where the present shape of the deforming bodies carries them.
-
-    A shape that is not shown, or whose simulation has gone astray, has none.
-    """
-    if not state.sets:
+def carry_spheres(state: SphereState, bodies: Sequence[Deformed | None]) -> None:
+    """Brings the spheres to where the present shapes of the deforming bodies carry them; None has none."""
+    if state.is_empty:
         return
     nodes = []
-    for rest, spheres in zip(state.shapes, state.sets, strict=True):
-        vertices = None if loose is None else loose.vertices_of(rest)
-        if vertices is None or not np.isfinite(vertices).all():
+    for spheres, opacity, body in zip(state.sets, state.opacity, bodies, strict=True):
+        if spheres is not None and body is None:
             hidden = np.zeros(len(spheres.leaves), np.float32)
             nodes.append((np.zeros((len(hidden), 3), np.float32), hidden, hidden))
-        else:
-            nodes.append(place_nodes(spheres, spheres.carried(vertices)))
+        elif spheres is not None and body is not None:
+            center, radius, weight = place_nodes(spheres, spheres.carried(body.vertices))
+            nodes.append((center, radius, np.float32(opacity) * weight))
     (table,) = state.tables.tables
     for array, parts in zip((table.center, table.radius, table.weight), zip(*nodes, strict=True), strict=True):
         values = np.concatenate(parts)
