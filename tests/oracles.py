@@ -63,8 +63,16 @@ def world_triangles(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndar
 def loose_triangles(renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
     """What the last picture showed of things without a rigid shape, in the world: vertices [V, 3] and faces [F, 3]."""
     stage = renderer._stage
-    mesh = stage.device_scene.meshes[stage.scene.entities[stage.scene.loose].mesh]
-    return mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3)
+    (table,) = stage.device_scene.geometry.tables
+    shown = table.radius.numpy() > 0.0
+    vertices, faces, total = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.int32)], 0
+    for entity in (*stage.scene.deforming, stage.scene.loose):
+        if entity >= 0 and shown[entity]:
+            mesh = stage.device_scene.meshes[stage.scene.entities[entity].mesh]
+            vertices.append(mesh.points.numpy())
+            faces.append(mesh.indices.numpy().reshape(-1, 3) + total)
+            total += len(vertices[-1])
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def traced_irradiance(
@@ -145,7 +153,7 @@ def shade_points(renderer: Renderer, geom: str, points: np.ndarray, normals: np.
     turn_occlusion(renderer._stage.occlusion, renderer._stage.device_scene, device)
     lights = (renderer._stage.occlusion, renderer._stage.lighting)
     spheres = renderer._stage.spheres
-    cuts = make_cuts(1, count, bool(spheres.sets), device)
+    cuts = make_cuts(1, count, not spheres.is_empty, device)
     choose_cuts(cuts, receivers, spheres, device)
     shade_direct(receivers, turns, 1, renderer._stage.device_scene, *lights, cuts, *received, device)
     return tuple(array.numpy()[0] for array in received)

@@ -17,8 +17,10 @@ from warp_psf.device import find_device
 from warp_psf.field.spheres import SphereSet, build_tree, place_nodes
 from warp_psf.field.store import load_arrays, save_arrays
 from warp_psf.scene import primitives
+from warp_psf.scene.material import Material
 from warp_psf.scene.receiver import make_receivers
-from warp_psf.shade.spheres import CLUSTER, CUT_SINE, MOST_IN_CUT, SphereState, choose_cuts, make_cuts, upload_spheres
+from warp_psf.scene.scene import Entity, Part, Scene
+from warp_psf.shade.spheres import CLUSTER, CUT_SINE, MOST_IN_CUT, choose_cuts, make_cuts, upload_spheres
 
 RANDOM = np.random.default_rng(5)
 
@@ -82,14 +84,17 @@ def test_spheres_behind_one_another_share_what_they_take():
     assert large == pytest.approx(1 - 0.5 * 0.09, abs=2e-3)
 
 
-def cut_of(spheres: SphereSet, center: np.ndarray, points: np.ndarray) -> list[set[int]]:
-    """The nodes of the cut of each cluster of receivers at points."""
+def cut_of(spheres: SphereSet, center: np.ndarray, points: np.ndarray, entity: int = 0) -> list[set[int]]:
+    """The nodes of the cut of each cluster of receivers at points of an entity; the spheres are entity 1's."""
     device = find_device()
-    state = SphereState((), (spheres,), upload_spheres((), (spheres,), 0, 1, device).tables)
+    part = Part("body", Material(np.zeros(3), np.zeros(3), 0.0, np.zeros(3)), -1, 0)
+    scene = Scene((), (Entity("floor", 0, (part,)), Entity("body", 0, (part,))), (), deforming=(1,))
+    state = upload_spheres(scene, (spheres,), 1, device)
     (table,) = state.tables.tables
     for array, values in zip((table.center, table.radius, table.weight), place_nodes(spheres, center), strict=True):
         array.assign(values[None])
     receivers = make_receivers((1, len(points)), device)
+    receivers.entity.fill_(entity)
     receivers.position.assign(np.asarray(points, np.float32)[None])
     cuts = make_cuts(1, len(points), True, device)
     choose_cuts(cuts, receivers, state, device)
@@ -128,6 +133,11 @@ def test_many_small_spheres_are_no_small_body():
     # Next to the cube each takes less than a thousandth of the view, and together they do not.
     (cut,) = cut_of(small, center, np.array([0.5, 0.5, 1.2]) + RANDOM.uniform(-0.05, 0.05, (CLUSTER, 3)))
     assert sum(int(spheres.leaves[node]) for node in cut) == 96
+
+
+def test_a_body_s_own_spheres_are_in_no_cut_of_its_receivers():
+    spheres, center = scatter(8)
+    assert cut_of(spheres, center, center, entity=1) == [set()]
 
 
 @pytest.mark.parametrize("spoil", [np.negative, np.zeros_like, lambda radius: 1e300 * radius, lambda radius: radius[0]])

@@ -14,13 +14,16 @@ from warp_psf.bridge import (
     build_scene,
     find_camera,
     looks,
+    meet_deforming,
     read_camera,
+    read_deformed,
     read_delta_lights,
     read_image_lights,
     read_loose,
     read_poses,
     read_skybox,
 )
+from warp_psf.bridge.deforming import DeformingBody
 from warp_psf.device import find_device
 from warp_psf.field.radiance import FUNCTION_COUNTS
 from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
@@ -28,7 +31,7 @@ from warp_psf.film.resolve import read_layers
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.light import Light
 from warp_psf.scene.loose import LooseRoom, make_room
-from warp_psf.stage import Progress, Settings, Stage, draw, place, place_loose, set_stage, take_over
+from warp_psf.stage import Progress, Settings, Stage, draw, place, place_deforming, place_loose, set_stage, take_over
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
@@ -126,7 +129,8 @@ class Renderer:
         self._scene = mujoco.MjvScene(model, int(max_geom))
         self._shown = 0
         self._looks = looks(model, self._option)
-        self._standing: Stage | None = self._set_stage(self._option, self._first_room())
+        self._bodies, room = self._meet(self._option)
+        self._standing: Stage | None = self._set_stage(self._option, self._bodies, room)
         self._depth_rendering = self._segmentation_rendering = False
         self._world_from_camera: np.ndarray | None = None
         self._drawn, self._drawn_geoms = False, 0
@@ -208,8 +212,9 @@ class Renderer:
             )
         now = looks(self._model, option)
         if now != self._looks:
-            self._standing = self._set_stage(option, stage.room)
-            self._looks, stage = now, self._stage
+            bodies, room = self._meet(option)
+            self._standing = self._set_stage(option, bodies, stage.room or room)
+            self._looks, self._bodies, stage = now, bodies, self._stage
         poses = read_poses(self._model, data, stage.scene, view.position)
         self._read_scene(data, option, find_camera(self._model, camera))
         place(stage, poses, view, read_delta_lights(self._model, data, stage.scene, view))
@@ -292,20 +297,22 @@ class Renderer:
             raise RuntimeError("the renderer is closed; make a new one")
         return self._standing
 
-    def _set_stage(self, option: mujoco.MjvOption, room: LooseRoom | None) -> Stage:
+    def _set_stage(self, option: mujoco.MjvOption, bodies: tuple[DeformingBody, ...], room: LooseRoom | None) -> Stage:
+        shapes = tuple(body.shape for body in bodies)
         scene = build_scene(
             self._model,
             option=option,
             material_space=self._material_space,
             lights=self._lights,
             model_lights=self._model_lights,
+            deforming=shapes,
             loose=room,
         )
         environments = [] if self._environment is None else [self._environment]
         if self._model_lights:
             environments += read_image_lights(self._model, self._material_space)
         background = self._skybox or next(iter(environments), None)
-        return set_stage(scene, environments, background, self._settings, room, self._progress)
+        return set_stage(scene, environments, background, self._settings, shapes, room, self._progress)
 
     def _draw(self) -> Stage:
         """The stage with the layers of the present state."""
@@ -314,43 +321,57 @@ class Renderer:
             raise RuntimeError("there is nothing to render yet; call update_scene(data, camera) first")
         if not self._drawn or self._scene.ngeom != self._drawn_geoms:
             stage = self._bring_loose(stage)
+            place_deforming(stage, read_deformed(self._model, self._scene, self._bodies))
             draw(stage)
             self._drawn, self._drawn_geoms = True, self._scene.ngeom
         return stage
 
     def _bring_loose(self, stage: Stage) -> Stage:
-        """Brings tendons, skins, flexes and added geoms to the stage, or to a larger one where they need more room."""
-        rigid = sum(len(entity.parts) for entity in stage.scene.entities if entity.parts[0].object_id >= 0)
+        """Brings tendons and added geoms to the stage, or to a larger one where they need more room."""
+        lasting = sum(len(entity.parts) for entity in stage.scene.entities if entity.parts[0].object_id >= 0)
         loose = None
-        if self._scene.ngeom > rigid:
+        if self._scene.ngeom > lasting:
             loose = read_loose(self._model, self._scene, self._shown, self._material_space, self._metres_per_pixel())
         if loose is not None and (stage.room is None or not stage.room.holds(loose)):
-            standing, self._standing = stage, self._set_stage(self._option_in_use, make_room(loose, stage.room))
+            standing, self._standing = stage, self._set_stage(self._option_in_use, self._bodies, make_room(loose))
             stage = self._stage
             take_over(stage, standing)
         if stage.room is not None:
             place_loose(stage, loose)
         return stage
 
-    def _first_room(self) -> LooseRoom | None:
-        """Room for what the model itself has without a rigid shape, as it is at the start."""
-        if self._model.ntendon + self._model.nflex + self._model.nskin == 0:
-            return None
-        data = mujoco.MjData(self._model)
-        mujoco.mj_forward(self._model, data)
-        self._read_scene(data, self._option, find_camera(self._model, -1))
-        loose = read_loose(self._model, self._scene, self._shown, self._material_space, 0.0)
-        return None if loose is None else make_room(loose)
+    def _meet(self, option: mujoco.MjvOption) -> tuple[tuple[DeformingBody, ...], LooseRoom | None]:
+        """The deforming bodies that `option` shows, as the model's initial state has them, and room for the rest."""
+        model = self._model
+        if model.ntendon + model.nflex + model.nskin == 0:
+            return (), None
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        view = mujoco.MjvScene(model, self._scene.maxgeom)
+        _update_view(view, model, data, option, find_camera(model, -1))
+        loose = read_loose(model, view, view.ngeom, self._material_space, 0.0)
+        bodies = meet_deforming(model, data, option, self._material_space)
+        return bodies, None if loose is None else make_room(loose)
 
     def _read_scene(self, data: mujoco.MjData, option: mujoco.MjvOption, camera: mujoco.MjvCamera) -> None:
-        every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, option, None, camera, every, self._scene)
+        _update_view(self._scene, self._model, data, option, camera)
         self._shown, self._option_in_use = self._scene.ngeom, option
 
     def _metres_per_pixel(self) -> float:
         """What a pixel of the picture spans at a distance of one metre."""
         left = self._scene.camera[0]
         return float((left.frustum_top - left.frustum_bottom) / left.frustum_near) / self.height
+
+
+def _update_view(
+    view: mujoco.MjvScene,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    option: mujoco.MjvOption,
+    camera: mujoco.MjvCamera,
+) -> None:
+    """Makes MuJoCo's abstract scene of a state."""
+    mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, view)
 
 
 def _check_model(model: mujoco.MjModel) -> None:

@@ -12,28 +12,25 @@ import warp as wp
 
 from warp_psf.bake import bake_radiance_field
 from warp_psf.bake.bodies import bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
+from warp_psf.bake.coarse import make_blockers
 from warp_psf.bake.kept import BakedBody
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import Film, make_film, resolve_pixels
 from warp_psf.film.tracing import any_seen_from_behind
 from warp_psf.scene.camera import Camera
+from warp_psf.scene.deforming import Deformed, DeformingShape
 from warp_psf.scene.detail import refine_flat_bodies
 from warp_psf.scene.environment import Environment
-from warp_psf.scene.geometry import DeviceScene, upload_scene, write_loose, write_poses
+from warp_psf.scene.geometry import DeviceScene, upload_scene, write_deforming, write_loose, write_poses
 from warp_psf.scene.light import DeltaLight, area_light_entities
 from warp_psf.scene.loose import Loose, LooseRoom
 from warp_psf.scene.scene import Poses, Scene
 from warp_psf.scene.tint import TextureTable, upload_textures
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
-from warp_psf.shade.delta import (
-    DeltaState,
-    add_delta_lights,
-    make_delta_lights,
-    write_delta_lights,
-    write_loose_opacity,
-)
+from warp_psf.shade.delta import DeltaState, add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import DirectState, shade_direct, upload_lighting, write_environment
 from warp_psf.shade.gloss import shade_gloss
+from warp_psf.shade.hemisphere import Hemispheres, bring_shapes, find_transfer, upload_hemispheres
 from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
@@ -94,6 +91,7 @@ class Stage:
     spheres: SphereState
     cuts: Cuts
     lighting: DirectState
+    hemispheres: Hemispheres
     delta_lights: DeltaState
     surfaces: Surfaces
     film: Film
@@ -116,12 +114,14 @@ def set_stage(
     environments: Sequence[Environment],
     background: Environment | None,
     settings: Settings,
+    shapes: Sequence[DeformingShape],
     room: LooseRoom | None,
     progress: Progress,
 ) -> Stage:
     """Bakes what a scene needs, or reads it from the cache, and puts it on the device.
 
-    environments: their light adds up. background: what is seen behind everything; None is black.
+    environments: their light adds up. background: what is seen behind everything; None is black. shapes: of the scene's
+    deforming entities. room: for its loose entity, None where it has none.
     progress: called as progress(what, share) while something is baked.
     """
     if settings.shading == "vertex":
@@ -141,9 +141,7 @@ def set_stage(
             radiance = np.ones(len(light.mesh.faces), np.float32)
             fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
     device_scene = upload_scene(scene, 1, device)
-    shapes = () if room is None else tuple(shape for shape in room.shapes if shape.casts)
-    sets = bake_sphere_sets(shapes, str(device), progress)
-    spheres = upload_spheres(shapes, sets, scene.loose, 1, device)
+    spheres = upload_spheres(scene, bake_sphere_sets(shapes, str(device), progress), 1, device)
     occlusion = upload_occlusion(scene, fields, log_fields, spheres.tables, order, 1, device)
     transfers = _transfers(bodies)
     shining = [(entity, light.radiance) for light, entity in area_lights]
@@ -151,6 +149,8 @@ def set_stage(
     if environments:
         write_environment(lighting, np.sum([each.project(order) for each in environments], axis=0))
     behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
+
+    blockers = [make_blockers(shape.name, shape.blocker_vertices, shape.blocker_faces) for shape in shapes]
 
     size = settings.width, settings.height
     see_through = any(entity.opacity < 1.0 for entity in scene.entities)
@@ -177,8 +177,9 @@ def set_stage(
         textures=upload_textures(scene, device),
         occlusion=occlusion,
         spheres=spheres,
-        cuts=_make_cuts(bool(spheres.sets), surfaces, vertices, bounces, device),
+        cuts=_make_cuts(spheres, surfaces, vertices, bounces, device),
         lighting=lighting,
+        hemispheres=upload_hemispheres(scene, shapes, blockers, order, 1, device),
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
         surfaces=surfaces,
         film=make_film(1, *size, behind, device),
@@ -205,11 +206,16 @@ def place(stage: Stage, poses: Poses, view: Camera, lights: tuple[DeltaLight, ..
     write_delta_lights(stage.delta_lights, [lights])
 
 
+def place_deforming(stage: Stage, bodies: Sequence[Deformed | None]) -> None:
+    """Brings the present shapes of the scene's deforming entities to the device, in order; None for one unseen."""
+    write_deforming(stage.device_scene, stage.scene, bodies)
+    carry_spheres(stage.spheres, bodies)
+    bring_shapes(stage.hemispheres, bodies, stage.settings.device)
+
+
 def place_loose(stage: Stage, loose: Loose | None) -> None:
-    """Brings what has no rigid shape to the device; the stage has a room that holds it."""
+    """Brings what has no lasting shape to the device; the stage has a room that holds it."""
     write_loose(stage.device_scene, stage.scene, loose)
-    carry_spheres(stage.spheres, loose)
-    write_loose_opacity(stage.delta_lights, stage.scene.loose, loose is not None and bool(loose.deforming.any()))
 
 
 def take_over(stage: Stage, before: Stage) -> None:
@@ -229,6 +235,9 @@ def draw(stage: Stage) -> None:
     scene, device, surfaces = stage.device_scene, stage.settings.device, stage.surfaces
     with _timed(stage, "primary visibility"):
         find_surfaces(scene, surfaces, device)
+    if stage.scene.deforming:
+        with _timed(stage, "self-shadows"):
+            find_transfer(stage.hemispheres, surfaces.receivers, scene, stage.lighting, device)
     with _timed(stage, "turn fields"):
         turn_occlusion(stage.occlusion, scene, device)
     if stage.vertices is None or stage.vertices_received is None:
@@ -301,7 +310,7 @@ def _make_see_through(stage: Stage) -> None:
     slots = stage.surfaces.slots
     stage.lattice = make_lattice(1, slots, *size, device)
     stage.received, stage.bounced = make_received(slots, device), make_received(slots, device)
-    stage.cuts = replace(stage.cuts, pixels=make_cuts(1, slots, bool(stage.spheres.sets), device))
+    stage.cuts = replace(stage.cuts, pixels=make_cuts(1, slots, not stage.spheres.is_empty, device))
     if stage.bounces is not None:
         stage.last_gather = make_last_gather(stage.bounces, settings.bounce_threshold, *size, slots, device)
 
@@ -323,7 +332,7 @@ def _transfers(bodies: list[BakedBody]) -> list[tuple[np.ndarray, np.ndarray] | 
 
 
 def _make_cuts(
-    has_spheres: bool,
+    spheres: SphereState,
     surfaces: Surfaces,
     vertices: VertexReceivers | None,
     bounces: BounceState | None,
@@ -332,7 +341,7 @@ def _make_cuts(
     of_vertices = 0 if vertices is None else vertices.receivers.entity.shape[1]
     of_proxies = 0 if bounces is None else bounces.proxies.entity.shape[1]
     counts = surfaces.slots, of_vertices, of_proxies
-    return Cuts(*(make_cuts(1, count, has_spheres, device) for count in counts))
+    return Cuts(*(make_cuts(1, count, not spheres.is_empty, device) for count in counts))
 
 
 def make_received(count: int, device: wp.Device) -> Received:

@@ -18,8 +18,8 @@ from warp_psf.bake.sphere_set import bake_shape_spheres
 from warp_psf.device import core_count, find_device
 from warp_psf.field.shells import ShadowField
 from warp_psf.field.spheres import SphereSet
+from warp_psf.scene.deforming import DeformingShape
 from warp_psf.scene.detail import refine_radiating
-from warp_psf.scene.loose import DeformingShape
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
 
@@ -84,14 +84,16 @@ def bake_logarithms(scene: Scene, bodies: list[BakedBody], progress: Progress) -
     return logarithms
 
 
-def bake_sphere_sets(shapes: Sequence[DeformingShape], device: str, progress: Progress) -> tuple[SphereSet, ...]:
-    """The blocker spheres of shapes that deform, bound to their vertices."""
-    sets = []
-    for shape in shapes:
+def bake_sphere_sets(shapes: Sequence[DeformingShape], device: str, progress: Progress) -> tuple[SphereSet | None, ...]:
+    """The blocker spheres of shapes that deform, bound to their vertices; None for one without a surface."""
+
+    def bake(shape: DeformingShape) -> SphereSet:
         progress(f"fitting spheres to {shape.name}", 0.0)
-        sets.append(bake_shape_spheres(shape, device=device))
+        spheres = bake_shape_spheres(shape, device=device)
         progress(f"fitting spheres to {shape.name}", 1.0)
-    return tuple(sets)
+        return spheres
+
+    return tuple(bake(shape) if shape.casts else None for shape in shapes)
 
 
 def _casting(scene: Scene, casts: list[bool]) -> list[int]:

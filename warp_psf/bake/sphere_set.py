@@ -14,7 +14,7 @@ from warp_psf.bake.spheres import fit_spheres
 from warp_psf.basis.sphere import fibonacci_cap, frame
 from warp_psf.field.spheres import SphereSet, build_tree
 from warp_psf.field.store import load_arrays, save_arrays
-from warp_psf.scene.loose import DeformingShape
+from warp_psf.scene.deforming import DeformingShape
 from warp_psf.scene.mesh import Mesh, make_mesh
 
 # Raised whenever the same mesh would give other spheres.

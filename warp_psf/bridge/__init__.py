@@ -1,6 +1,7 @@
 """MuJoCo's models and data as scenes, poses, lights and cameras."""
 
 from warp_psf.bridge.cameras import find_camera, read_camera
+from warp_psf.bridge.deforming import meet_deforming, read_deformed
 from warp_psf.bridge.entities import build_scene, read_poses
 from warp_psf.bridge.lights import read_delta_lights
 from warp_psf.bridge.loose import read_loose
@@ -14,7 +15,9 @@ __all__ = [
     "find_camera",
     "load_model",
     "looks",
+    "meet_deforming",
     "read_camera",
+    "read_deformed",
     "read_delta_lights",
     "read_image_lights",
     "read_loose",

@@ -14,7 +14,8 @@ from warp_psf.bridge.look import SPACES, find_texture, make_material, read_textu
 from warp_psf.bridge.mapping import make_mapping, mesh_coordinates
 from warp_psf.bridge.model import check_data, label
 from warp_psf.bridge.shapes import ShapeKey, geom_shape_key, make_shape, plane_step, site_shape_key
-from warp_psf.bridge.shown import OPAQUE, Shown, find_shown
+from warp_psf.bridge.shown import OPAQUE, Shown, find_shown, flex_materials
+from warp_psf.scene.deforming import DeformingShape, make_entity
 from warp_psf.scene.join import join_meshes
 from warp_psf.scene.light import AreaLight, Light, area_light_entities, check_lights
 from warp_psf.scene.loose import LooseRoom, reserve
@@ -33,21 +34,23 @@ def build_scene(
     material_space: str = "srgb",
     lights: Sequence[Light] = (),
     model_lights: bool = True,
+    deforming: Sequence[DeformingShape] = (),
     loose: LooseRoom | None = None,
 ) -> Scene:
     """Everything about a model that does not change from frame to frame.
 
-    Entities are the geoms that `option` shows, alone or in groups (`group_geoms`), then the sites, then one that stands
-    for all that has no rigid shape (`read_loose`), then one for every `AreaLight` (`area_light_entities` pairs them).
-    Equal shapes share a mesh. A plane without a size becomes a square that reaches beyond what the camera sees. Sites
-    and loose things are seen and shaded, but take light from nothing.
+    Entities are the geoms that `option` shows, alone or in groups (`group_geoms`), then the sites, then the bodies that
+    deform (`meet_deforming`), then one that stands for all that has no lasting shape (`read_loose`), then one for every
+    `AreaLight` (`area_light_entities` pairs them). Equal shapes share a mesh. A plane without a size becomes a square
+    that reaches beyond what the camera sees. Sites and loose things are seen and shaded, but take light from nothing.
 
     Args:
         option: what is shown; MuJoCo's defaults without.
         material_space: what MJCF's rgba and textures mean: "srgb" is decoded to linear, "linear" is taken as it is.
         lights: area lights, and any others, in addition to the model's.
         model_lights: False leaves out the model's lights and its headlight.
-        loose: room for what has no rigid shape; None for none.
+        deforming: the skins and flexes that `option` shows.
+        loose: room for what has no lasting shape; None for none.
 
     Returns:
         The scene; its lights are the area lights of `lights` first, then the others, then the model's, headlight last.
@@ -71,6 +74,7 @@ def build_scene(
         if key is not None:
             rgba, material = build.shown.site_rgba[site], int(model.site_matid[site])
             build.add(key, "site", site, rgba, material, casts=False)
+    places = tuple(build.add_deforming(shape) for shape in deforming)
     place_of_loose = -1
     if loose is not None:
         place_of_loose = len(build.entities)
@@ -84,7 +88,7 @@ def build_scene(
     others = [light for light in lights if not isinstance(light, AreaLight)]
     of_model = model_lights_of(model) if model_lights else []
     lamps = (*area, *others, *of_model)
-    return Scene(tuple(build.shapes), tuple(build.entities), lamps, tuple(build.textures), place_of_loose)
+    return Scene(tuple(build.shapes), tuple(build.entities), lamps, tuple(build.textures), place_of_loose, places)
 
 
 def read_poses(model: mujoco.MjModel, data: mujoco.MjData, scene: Scene, eye: np.ndarray | None = None) -> Poses:
@@ -99,7 +103,7 @@ def read_poses(model: mujoco.MjModel, data: mujoco.MjData, scene: Scene, eye: np
     area = area_light_entities(scene)
     objects = scene.entities[: len(scene.entities) - len(area)]
     position = np.zeros((1, len(scene.entities), 3), dtype=np.float32)
-    # What is loose lies in the world's frame.
+    # What deforms and what is loose lies in the world's frame.
     rotation = np.tile(np.eye(3, dtype=np.float32), (1, len(scene.entities), 1, 1))
     kinds = np.array([entity.parts[0].object_type for entity in objects], np.int64)
     ids = np.array([entity.parts[0].object_id for entity in objects], np.int64)
@@ -228,6 +232,19 @@ class _Build:
             shape = int(model.site_type[index]), model.site_size[index], -1
         mapping = make_mapping(model, *shape, material, texture)
         return Part(name, look, index, int(object_type), self._texture(texture), mapping)
+
+    def add_deforming(self, shape: DeformingShape) -> int:
+        """Adds a skin or flex; returns its place among the entities."""
+        part = shape.part
+        if shape.texture_coordinates is not None:
+            is_skin = part.object_type == OBJECT.mjOBJ_SKIN
+            materials = self.model.skin_matid if is_skin else flex_materials(self.model)
+            texture = find_texture(self.model, int(materials[part.object_id]))
+            part = replace(part, texture=self._texture(texture))
+        mesh, entity = make_entity(shape, len(self.shapes), part)
+        self.shapes.append(mesh)
+        self.entities.append(entity)
+        return len(self.entities) - 1
 
     def add_light(self, light: AreaLight) -> None:
         """Adds the shining body of an area light; lights that were given the same mesh share it, like geoms."""

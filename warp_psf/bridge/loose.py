@@ -1,4 +1,4 @@
-"""Tendons, skins and flexes as MuJoCo's visualiser shapes them in a frame, and the geoms that a script has added."""
+"""Tendons as MuJoCo's visualiser shapes them in a frame, and the geoms that a script has added."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ GEOM, OBJECT = mujoco.mjtGeom, mujoco.mjtObj
 # MuJoCo's arrows: how much wider the head is than the shaft.
 HEAD = 1.75
 DECOR = mujoco.mjtCatBit.mjCAT_DECOR
-DEFORMING = (int(OBJECT.mjOBJ_FLEX), int(OBJECT.mjOBJ_SKIN))
+HAVE_ENTITIES = (OBJECT.mjOBJ_GEOM, OBJECT.mjOBJ_SITE, OBJECT.mjOBJ_FLEX, OBJECT.mjOBJ_SKIN)
 
 
 def read_loose(
     model: mujoco.MjModel, view: mujoco.MjvScene, shown: int, material_space: str, metres_per_pixel: float
 ) -> Loose | None:
-    """What has no rigid shape in MuJoCo's abstract scene, None where there is nothing of that.
+    """What has no lasting shape in MuJoCo's abstract scene, None where there is nothing of that.
 
     view: after mjv_updateScene. shown: how many geoms that left in it; those behind were added by a script and are
     drawn too, while MuJoCo's own decor (contacts, frames, joints) is not. metres_per_pixel: at a distance of 1 m, for
@@ -37,11 +37,11 @@ def read_loose(
     eye = 0.5 * (np.array(view.camera[0].pos) + np.array(view.camera[1].pos))
     for index, geom in enumerate(view.geoms[: view.ngeom]):
         added = index >= shown
-        if added or (geom.objtype not in (OBJECT.mjOBJ_GEOM, OBJECT.mjOBJ_SITE) and geom.category != DECOR):
+        if added or (geom.objtype not in HAVE_ENTITIES and geom.category != DECOR):
             if added:
                 _check_added(model, geom)
             if geom.rgba[3] != 0.0:
-                surface = _surface(model, view, geom, eye, metres_per_pixel)
+                surface = _surface(model, geom, eye, metres_per_pixel)
                 if surface is not None and len(surface[2]) > 0:
                     surfaces.append(surface)
                     parts.append(_part(model, geom, material_space))
@@ -56,8 +56,6 @@ def read_loose(
         faces.astype(np.int32),
         np.repeat(np.arange(len(parts)), [len(faces) for _, _, faces in surfaces]).astype(np.int32),
         tuple(parts),
-        np.concatenate([[0], np.cumsum(counts)]),
-        np.array([part.object_type in DEFORMING for part in parts]),
     )
 
 
@@ -74,21 +72,13 @@ def _check_added(model: mujoco.MjModel, geom: mujoco.MjvGeom) -> None:
 
 
 def _part(model: mujoco.MjModel, geom: mujoco.MjvGeom, material_space: str) -> Part:
-    kinds = {OBJECT.mjOBJ_TENDON: "tendon", OBJECT.mjOBJ_FLEX: "flex", OBJECT.mjOBJ_SKIN: "skin"}
-    kind = kinds.get(geom.objtype)
-    name = label(model, kind, geom.objid) if kind else "added geom"
+    name = label(model, "tendon", geom.objid) if geom.objtype == OBJECT.mjOBJ_TENDON else "added geom"
     material = make_material(model, np.array(geom.rgba), int(geom.matid), material_space)
     return Part(name, material, int(geom.objid), int(geom.objtype))
 
 
-def _surface(
-    model: mujoco.MjModel, view: mujoco.MjvScene, geom: mujoco.MjvGeom, eye: np.ndarray, metres_per_pixel: float
-) -> Surface | None:
+def _surface(model: mujoco.MjModel, geom: mujoco.MjvGeom, eye: np.ndarray, metres_per_pixel: float) -> Surface | None:
     """Vertices, normals and faces of a geom in the world; None for what has no surface."""
-    if geom.type == GEOM.mjGEOM_FLEX:
-        return _flex(view, geom)
-    if geom.type == GEOM.mjGEOM_SKIN:
-        return _skin(model, view, geom.objid)
     size = np.array(geom.size, np.float64)
     position, rotation = np.array(geom.pos, np.float64), np.array(geom.mat, np.float64).reshape(3, 3)
     thickness = 0.5 * size[0] * metres_per_pixel * float(np.linalg.norm(position - eye))
@@ -100,32 +90,6 @@ def _surface(
         return solids.place(solids.wires(size, thickness / max(size[0], 1e-9)), position, rotation)
     local = _solid(int(geom.type), size)
     return None if local is None else solids.place(local, position, rotation)
-
-
-def _flex(view: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Surface | None:
-    """A flex: its faces, and where it has none the tubes along its edges."""
-    which, radius = int(geom.objid), float(geom.size[0])
-    used = int(view.flexfaceused[which])
-    if used > 0:
-        corners = slice(9 * int(view.flexfaceadr[which]), 9 * (int(view.flexfaceadr[which]) + used))
-        vertices = np.asarray(view.flexface[corners]).reshape(-1, 3)
-        normals = np.asarray(view.flexnormal[corners]).reshape(-1, 3)
-        return vertices, normals, np.arange(3 * used).reshape(-1, 3)
-    if radius <= 0.0:
-        return None
-    first = int(view.flexvertadr[which])
-    start, count = int(view.flexedgeadr[which]), int(view.flexedgenum[which])
-    points = np.asarray(view.flexvert, np.float64).reshape(-1, 3)
-    ends = points[first + np.asarray(view.flexedge[2 * start : 2 * (start + count)]).reshape(-1, 2)]
-    return solids.join(*(solids.tube(a, b, radius) for a, b in ends)) if count else None
-
-
-def _skin(model: mujoco.MjModel, view: mujoco.MjvScene, which: int) -> Surface:
-    first, count = int(view.skinvertadr[which]), int(view.skinvertnum[which])
-    rows = slice(3 * first, 3 * (first + count))
-    vertices, normals = (np.asarray(values[rows]).reshape(-1, 3) for values in (view.skinvert, view.skinnormal))
-    faces = slice(model.skin_faceadr[which], model.skin_faceadr[which] + model.skin_facenum[which])
-    return vertices, normals, np.asarray(model.skin_face[faces])
 
 
 def _model_mesh(model: mujoco.MjModel, which: int) -> Surface:

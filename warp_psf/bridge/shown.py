@@ -17,6 +17,8 @@ FLAG = mujoco.mjtVisFlag
 LOOKS = (
     *("geom_type", "geom_dataid", "geom_group", "geom_matid", "geom_rgba", "geom_size", "geom_pos", "geom_quat"),
     *("site_type", "site_group", "site_matid", "site_rgba", "site_size"),
+    *("flex_group", "flex_matid", "flex_rgba", "flex_radius", "flex_flatskin", "flex_texcoord"),
+    *("skin_group", "skin_matid", "skin_rgba", "skin_inflate", "skin_texcoord"),
     *("mat_rgba", "mat_emission", "mat_specular", "mat_shininess", "mat_texid", "mat_texrepeat", "mat_texuniform"),
     *("mat_metallic", "mat_roughness", "mat_reflectance"),
     *("light_type", "light_diffuse", "light_specular", "light_ambient", "light_attenuation", "light_cutoff"),
@@ -24,20 +26,27 @@ LOOKS = (
 )
 
 
+FLEX_FLAGS = (FLAG.mjVIS_FLEXVERT, FLAG.mjVIS_FLEXEDGE, FLAG.mjVIS_FLEXFACE, FLAG.mjVIS_FLEXSKIN)
+
+
 @dataclass(frozen=True)
 class Shown:
     """What is drawn.
 
-    geoms, sites: ids, in order.
-    geom_rgba, site_rgba: the colours and alphas of all geoms and of all sites as they are drawn, float32 [ngeom or
-        nsite, 4].
+    geoms, sites, flexes, skins: ids, in order.
+    geom_rgba, site_rgba, flex_rgba, skin_rgba: the colours and alphas of all of the model's as they are drawn, float32
+        [ngeom, nsite, nflex or nskin, 4].
     textured: whether textures show.
     """
 
     geoms: tuple[int, ...]
     sites: tuple[int, ...]
+    flexes: tuple[int, ...]
+    skins: tuple[int, ...]
     geom_rgba: np.ndarray
     site_rgba: np.ndarray
+    flex_rgba: np.ndarray
+    skin_rgba: np.ndarray
     textured: bool
 
 
@@ -45,27 +54,48 @@ def find_shown(model: mujoco.MjModel, option: mujoco.MjvOption) -> Shown:
     """What `option` shows of a model, by the rules of MuJoCo's visualiser; see-through bodies stay separate bodies."""
     geom_rgba = _colors(model, model.geom_rgba, model.geom_matid)
     site_rgba = _colors(model, model.site_rgba, model.site_matid)
+    flex_rgba = _colors(model, model.flex_rgba, flex_materials(model))
+    skin_rgba = _colors(model, model.skin_rgba, model.skin_matid)
     static_geoms, static_sites = (model.body_weldid[body] == 0 for body in (model.geom_bodyid, model.site_bodyid))
     if option.flags[FLAG.mjVIS_TRANSPARENT]:
         geom_rgba[~static_geoms, 3] *= model.vis.map.alpha
         site_rgba[~static_sites, 3] *= model.vis.map.alpha
+        # Whatever these hang on, they count as moving.
+        flex_rgba[:, 3] *= model.vis.map.alpha
+        skin_rgba[:, 3] *= model.vis.map.alpha
     geoms = _in_groups(model.geom_group, option.geomgroup) & (geom_rgba[:, 3] > 0.0)
     sites = _in_groups(model.site_group, option.sitegroup) & (site_rgba[:, 3] > 0.0)
     if not option.flags[FLAG.mjVIS_STATIC]:
         geoms, sites = geoms & ~static_geoms, sites & ~static_sites
-    ids = (tuple(map(int, np.flatnonzero(mask))) for mask in (geoms, sites))
-    return Shown(*ids, geom_rgba, site_rgba, bool(option.flags[FLAG.mjVIS_TEXTURE]))
+    flexes = _in_groups(model.flex_group, option.flexgroup) & (flex_rgba[:, 3] > 0.0) & any(_flags(option, FLEX_FLAGS))
+    skins = _in_groups(model.skin_group, option.skingroup) & (skin_rgba[:, 3] > 0.0) & option.flags[FLAG.mjVIS_SKIN]
+    ids = (tuple(map(int, np.flatnonzero(mask))) for mask in (geoms, sites, flexes, skins))
+    return Shown(*ids, geom_rgba, site_rgba, flex_rgba, skin_rgba, bool(option.flags[FLAG.mjVIS_TEXTURE]))
+
+
+def flex_materials(model: mujoco.MjModel) -> np.ndarray:
+    """The material of each flex, -1 for none: since MuJoCo 4 that of its first element."""
+    if len(model.flex_matid) == model.nflex:
+        return model.flex_matid
+    return model.flex_matid[model.flex_elemadr]
 
 
 def looks(model: mujoco.MjModel, option: mujoco.MjvOption) -> bytes:
-    """Equal for as long as `build_scene` would build the same scene of a model that is being rendered."""
+    """Equal for as long as `build_scene` and `meet_deforming` would build the same of a model being rendered."""
     arrays = [getattr(model, name) for name in LOOKS if hasattr(model, name)]
-    flags = [option.flags[flag] for flag in (FLAG.mjVIS_TRANSPARENT, FLAG.mjVIS_STATIC, FLAG.mjVIS_TEXTURE)]
+    choices = [option.geomgroup, option.sitegroup]
+    choices.append(_flags(option, (FLAG.mjVIS_TRANSPARENT, FLAG.mjVIS_STATIC, FLAG.mjVIS_TEXTURE)))
+    if model.nflex > 0:
+        choices += [option.flexgroup, _flags(option, FLEX_FLAGS), option.flex_layer]
+    if model.nskin > 0:
+        choices += [option.skingroup, _flags(option, (FLAG.mjVIS_SKIN,))]
     head = model.vis.headlight
     heads = (head.active, head.diffuse, head.specular, head.ambient)
-    return b"".join(
-        np.asarray(array).tobytes() for array in (*arrays, *heads, option.geomgroup, option.sitegroup, flags)
-    )
+    return b"".join(np.asarray(array).tobytes() for array in (*arrays, *heads, *choices))
+
+
+def _flags(option: mujoco.MjvOption, flags: tuple[mujoco.mjtVisFlag, ...]) -> list[bool]:
+    return [bool(option.flags[flag]) for flag in flags]
 
 
 def _colors(model: mujoco.MjModel, own: np.ndarray, material: np.ndarray) -> np.ndarray:

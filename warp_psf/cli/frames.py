@@ -31,7 +31,8 @@ def run_simulation(
     build: returns the MjModel.
     states: takes the model and the frames per second, and yields the MjData of frame 0, 1, 2, ...
     name: of the simulation; frames go to out/NAME by default.
-    camera, environment, lights: what the simulation is rendered with, unless the command line says otherwise.
+    camera, environment, lights: what the simulation is rendered with, unless the command line says otherwise. Where
+        light changes, `environment` is a function of the time in seconds.
     """
 
     def simulate(**values: Any) -> None:
@@ -78,7 +79,7 @@ def render_frames(
     settings |= {
         "model": f"{name} {fingerprint(model)}",
         "camera": chosen_camera,
-        "environment": describe_environment(environment),
+        "environment": _describe_light(environment, frames, options.fps),
         "lights": fingerprint(lights) if lights else None,
         "size": f"{width}x{height}",
     }
@@ -87,7 +88,8 @@ def render_frames(
 
     files = {"formats": formats, "frames_per_second": options.fps, "overwrite": options.overwrite}
     sequence = FrameSequence(options.out, settings, frames=frames, **files)
-    same |= {"environment": environment, "lights": lights, "device": options.device}
+    light = (lambda index: environment(index / options.fps)) if callable(environment) else None
+    same |= {"environment": None if light else environment, "lights": lights, "device": options.device}
     with progress_bar() as bar, Renderer(model, height, width, **same, progress=show_on(bar)) as renderer:
         stream = _frame_states(states, model, options.fps)
         # What the renderer refuses, such as a camera that is not there, it refuses before the folder is touched.
@@ -96,7 +98,7 @@ def render_frames(
         if renderer.vertices == 0:
             warnings.warn(f"{name} shows no geoms, so that only the environment is rendered", stacklevel=2)
         with sequence:
-            rendered = _render_missing(sequence, chain([first], stream), renderer, chosen_camera, bar)
+            rendered = _render_missing(sequence, chain([first], stream), renderer, chosen_camera, light, bar)
             sequence.finish()
     kept = len(frames) - rendered
     typer.echo(f"{rendered} frames rendered{f', {kept} were there' if kept else ''}: {options.out}")
@@ -108,8 +110,21 @@ def _find_camera(model: Any, chosen: str) -> int | str:
     return int(chosen) if re.fullmatch(r"-?\d{1,9}", chosen) and chosen not in names else chosen
 
 
-def _render_missing(sequence: Any, stream: Iterator[Any], renderer: Any, camera: str | int, bar: Any) -> int:
-    """Steps the simulation up to the last missing frame, renders and writes the missing ones, and counts them."""
+def _describe_light(environment: Any, frames: range, frames_per_second: float) -> str:
+    """What an environment is, or one that changes is at the start, in the middle and at the end."""
+    if not callable(environment) or not frames:
+        return describe_environment(environment)
+    times = (frames[index] / frames_per_second for index in (0, len(frames) // 2, -1))
+    return fingerprint([environment(time) for time in times])
+
+
+def _render_missing(
+    sequence: Any, stream: Iterator[Any], renderer: Any, camera: str | int, light: Callable | None, bar: Any
+) -> int:
+    """Steps the simulation up to the last missing frame, renders and writes the missing ones, and counts them.
+
+    light: gives the environment of each frame, where it changes.
+    """
     missing = [index for index in sequence.frames if sequence.missing(index)]
     task = bar.add_task("Frames", total=len(missing), rate="")
     start, done = time.perf_counter(), 0
@@ -117,6 +132,8 @@ def _render_missing(sequence: Any, stream: Iterator[Any], renderer: Any, camera:
     for index, data in zip(range(missing[-1] + 1 if missing else 0), stream, strict=False):
         if index == missing[done]:
             renderer.update_scene(data, camera=camera)
+            if light is not None:
+                renderer.environment = light(index)
             image = renderer.render()
             sequence.write(index, renderer.layers(), image, renderer.world_from_camera)
             done += 1

@@ -1,11 +1,13 @@
 """The scene on the device: merged meshes with their ray-query trees, materials, and the poses of a frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warp_psf.device import upload_tables
+from warp_psf.scene.deforming import Deformed
 from warp_psf.scene.loose import Loose
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Poses, Scene
@@ -27,7 +29,6 @@ class GeometryTable:
     lower: wp.array(dtype=wp.vec3)  # (entity): corners of the bounding box, in the entity's frame
     upper: wp.array(dtype=wp.vec3)  # (entity)
     convex: wp.array(dtype=wp.bool)  # (entity)
-    shadow_group: wp.array(dtype=wp.int32)  # (entity): the group of its mesh's faces that stop rays, -1: all do
     opacity: wp.array(dtype=wp.float32)  # (entity), in (0, 1]
     specular: wp.array(dtype=wp.vec3)  # (entity)
     exponent: wp.array(dtype=wp.float32)  # (entity)
@@ -48,8 +49,6 @@ class PoseTable:
     rotation: wp.array2d(dtype=wp.mat33)  # (world, entity), world_from_entity
 
 
-# The group of a loose entity's faces that cast shadows: those of deforming bodies, and not those of mere marks.
-CASTING = 0
 # What kernels and device functions take: arrays of one table (see `device.upload_tables`).
 GeometryTables = wp.array(dtype=GeometryTable)
 PoseTables = wp.array(dtype=PoseTable)
@@ -134,8 +133,6 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     table.radius = per_entity([mesh.radius for mesh in shapes], wp.float32)
     table.lower = per_entity([wp.vec3(*map(float, mesh.vertices.min(axis=0))) for mesh in shapes], wp.vec3)
     table.upper = per_entity([wp.vec3(*map(float, mesh.vertices.max(axis=0))) for mesh in shapes], wp.vec3)
-    shadow_group = [CASTING if index == scene.loose else -1 for index in range(len(shapes))]
-    table.shadow_group = per_entity(shadow_group, wp.int32)
     table.convex = per_entity([mesh.convex for mesh in shapes], wp.bool)
     table.opacity = per_entity([entity.opacity for entity in scene.entities], wp.float32)
     table.specular = per_entity([wp.vec3(*map(float, lobe.specular)) for lobe in lobes], wp.vec3)
@@ -173,18 +170,32 @@ def write_poses(device_scene: DeviceScene, poses: Poses) -> None:
     table.rotation.assign(poses.rotation)
 
 
+def write_deforming(device_scene: DeviceScene, scene: Scene, bodies: Sequence[Deformed | None]) -> None:
+    """Brings the present shapes of the scene's deforming entities to the device; None leaves nothing of one.
+
+    bodies: as `Scene.deforming`.
+    """
+    (table,) = device_scene.geometry.tables
+    for entity, body in zip(scene.deforming, bodies, strict=True):
+        if body is not None:
+            mesh = scene.entities[entity].mesh
+            first, _ = _before(scene, mesh)
+            _write(table.vertices, first, body.vertices)
+            _write(table.normals, first, body.normals)
+            # Fitting the old tree to the new boxes would take a tenth of the time, and the further the body gets from
+            # the shape for which that was built, the more of its boxes overlap: rays then take longer than is won.
+            points = table.vertices[first : first + len(body.vertices)]
+            _replace_mesh(device_scene, mesh, wp.Mesh(points=points, indices=device_scene.meshes[mesh].indices))
+        _write_bounds(device_scene, entity, None if body is None else body.vertices)
+
+
 def write_loose(device_scene: DeviceScene, scene: Scene, loose: Loose | None) -> None:
     """Brings the present shape of the scene's loose entity to the device; None leaves nothing of it."""
     (table,), entity = device_scene.geometry.tables, scene.loose
     mesh = scene.entities[entity].mesh
-    # A box that is inside out is hit by nothing.
-    lower, upper, center, radius = np.full(3, 1e30), np.full(3, -1e30), np.zeros(3), 0.0
     if loose is not None:
-        lower, upper = loose.vertices.min(axis=0), loose.vertices.max(axis=0)
-        center = 0.5 * (lower + upper)
-        radius = float(np.linalg.norm(loose.vertices - center, axis=1).max())
         device = table.vertices.device
-        first_vertex, first_face = (sum(len(part) for part in parts) for parts in _before(scene, mesh))
+        first_vertex, first_face = _before(scene, mesh)
         _write(table.vertices, first_vertex, loose.vertices)
         _write(table.normals, first_vertex, loose.normals)
         _write(table.faces, first_face, loose.faces)
@@ -196,18 +207,34 @@ def write_loose(device_scene: DeviceScene, scene: Scene, loose: Loose | None) ->
         _write(table.object_type, first_part, np.array([part.object_type for part in loose.parts], np.int32))
         points = wp.array(loose.vertices, dtype=wp.vec3, device=device)
         indices = wp.array(loose.faces.reshape(-1), dtype=wp.int32, device=device)
-        casting = np.where(loose.deforming[loose.face_part], CASTING, CASTING + 1)
-        groups = wp.array(casting, dtype=wp.int32, device=device)
-        device_scene.meshes[mesh] = wp.Mesh(points=points, indices=indices, groups=groups)
-        _write(table.mesh_id, mesh, np.array([device_scene.meshes[mesh].id], np.uint64))
+        _replace_mesh(device_scene, mesh, wp.Mesh(points=points, indices=indices))
+    _write_bounds(device_scene, entity, None if loose is None else loose.vertices)
+
+
+def _before(scene: Scene, mesh: int) -> tuple[int, int]:
+    """How many vertices and faces there are before a mesh's."""
+    before = scene.meshes[:mesh]
+    return sum(len(shape.vertices) for shape in before), sum(len(shape.faces) for shape in before)
+
+
+def _replace_mesh(device_scene: DeviceScene, mesh: int, new: wp.Mesh) -> None:
+    device_scene.meshes[mesh] = new
+    _write(device_scene.geometry.tables[0].mesh_id, mesh, np.array([new.id], np.uint64))
+
+
+def _write_bounds(device_scene: DeviceScene, entity: int, vertices: np.ndarray | None) -> None:
+    """Brings the bounds of an entity that lies in the world's frame to the device."""
+    (table,) = device_scene.geometry.tables
+    # A box that is inside out is hit by nothing.
+    lower, upper, center, radius = np.full(3, 1e30), np.full(3, -1e30), np.zeros(3), 0.0
+    if vertices is not None:
+        lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+        center = 0.5 * (lower + upper)
+        radius = float(np.linalg.norm(vertices - center, axis=1).max())
     _write(table.lower, entity, lower[None].astype(np.float32))
     _write(table.upper, entity, upper[None].astype(np.float32))
     _write(table.center, entity, center[None].astype(np.float32))
     _write(table.radius, entity, np.array([radius], np.float32))
-
-
-def _before(scene: Scene, mesh: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    return [shape.vertices for shape in scene.meshes[:mesh]], [shape.faces for shape in scene.meshes[:mesh]]
 
 
 def _write(array: wp.array, first: int, values: np.ndarray) -> None:

@@ -33,7 +33,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Entity:
-    """One rigid thing that is seen and shaded, and that casts shadows and reflects light.
+    """One thing that is seen and shaded, and that casts shadows and reflects light.
 
     name: what messages call it.
     mesh: index into `Scene.meshes`; entities with the same shape share a mesh.
@@ -42,7 +42,8 @@ class Entity:
     texture_coordinates: (s, t) of each face's corners, float32 [F, 3, 2], for parts whose mesh brings its own; else
         None.
     opacity: the share of light that it stops, in (0, 1].
-    casts: False for what is only seen: it takes no light from others and sends none.
+    casts: False for what neither takes light from others by a field of its own nor sends any: marks, which are only
+        seen, and deforming bodies, which have other ways.
     """
 
     name: str
@@ -64,7 +65,7 @@ class Scene:
     """The unchanging part: shapes, entities, their textures, and the lights that move with them.
 
     loose: the entity that stands for tendons and added geoms, -1 for none.
-    deforming: the entities that deform, whose vertices move in every frame.
+    deforming: the entities that deform, whose vertices move in every frame, in the world.
     """
 
     meshes: tuple[Mesh, ...]

@@ -5,6 +5,7 @@ remains open against spherical harmonics and the cosine. The result, its transfe
 bake; from there on a deforming body is shaded as they are.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -12,11 +13,23 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_psf.basis.visibility_mask import BATCH, MaskTables, batch, cover, make_masks, mask, plane_snippet
+from warp_psf.basis.visibility_mask import (
+    BATCH,
+    MaskTables,
+    batch,
+    cover,
+    make_masks,
+    mask,
+    plane_snippet,
+    upload_masks,
+)
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.blockers import BlockerSet
+from warp_psf.scene.deforming import Deformed, DeformingShape
 from warp_psf.scene.geometry import DeviceScene, GeometryTables
 from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.direct import DirectState
 
 # The origin of a mask leaves the surface by this share of the body's radius, as in the bake of rigid bodies: faces that
 # meet at a vertex then hide what they should of its valleys.
@@ -274,6 +287,20 @@ class HemisphereState:
     tables: wp.array
 
 
+@dataclass(frozen=True, eq=False)
+class Hemispheres:
+    """The deforming bodies of a scene.
+
+    states: per entity. exponents: of their Phong lobes, per entity. shapes: what was brought last, per entity.
+    masks: what masks are drawn with, None where nothing deforms.
+    """
+
+    states: dict[int, HemisphereState]
+    exponents: dict[int, float]
+    shapes: dict[int, Deformed]
+    masks: wp.array | None
+
+
 def upload_blockers(
     blockers: BlockerSet, blocker_of: np.ndarray, radius: float, worlds: int, device: wp.Device
 ) -> HemisphereState:
@@ -359,3 +386,55 @@ def integrate_lobes(
     reflected, of all vertices whose masks are known, as `integrate_masks` does."""
     inputs = [state.tables, masks, eye, exponent, first_row]
     launch(make_hemisphere(order).integrate_lobe, state.table.position.shape, inputs, [gloss], device)
+
+
+def upload_hemispheres(
+    scene: Scene,
+    shapes: Sequence[DeformingShape],
+    blockers: Sequence[BlockerSet],
+    order: int,
+    worlds: int,
+    device: wp.Device,
+) -> Hemispheres:
+    """Room for the transfer of a scene's deforming entities; shapes and blockers are given in their order."""
+    entities = scene.deforming
+    states, exponents = {}, {}
+    for entity, shape, of_shape in zip(entities, shapes, blockers, strict=True):
+        radius = scene.meshes[scene.entities[entity].mesh].radius
+        states[entity] = upload_blockers(of_shape, shape.blocker_of, radius, worlds, device)
+        exponents[entity] = float(scene.entities[entity].lobe.exponent)
+    return Hemispheres(states, exponents, {}, upload_masks(order, device) if entities else None)
+
+
+def bring_shapes(hemispheres: Hemispheres, bodies: Sequence[Deformed | None], device: wp.Device) -> None:
+    """Brings the present shapes to the device, in order; what is still keeps its transfer. None: not shown."""
+    for (entity, state), body in zip(hemispheres.states.items(), bodies, strict=True):
+        before = hemispheres.shapes.get(entity)
+        if body is None or (before is not None and _is_same(body, before)):
+            continue
+        hemispheres.shapes[entity] = body
+        shape = (np.broadcast_to(part, (state.table.position.shape[0], *part.shape)) for part in _parts(body))
+        bring_shape(state, *shape, device)
+
+
+def find_transfer(
+    hemispheres: Hemispheres, pixels: ReceiverTable, scene: DeviceScene, lighting: DirectState, device: wp.Device
+) -> None:
+    """Finds the transfer of the vertices that pixels see into the rows of the lighting's table."""
+    for entity, state in hemispheres.states.items():
+        first_row, first_gloss = lighting.rows[entity]
+        table, order, masks = lighting.table, lighting.order, hemispheres.masks
+        mark_seen(state, entity, pixels, scene, device)
+        rasterise_masks(state, masks, device)
+        integrate_masks(state, masks, order, first_row, table.transfer, table.self_visibility, device)
+        if first_gloss >= 0:
+            exponent = hemispheres.exponents[entity]
+            integrate_lobes(state, masks, order, table.eye, exponent, first_gloss, table.gloss, device)
+
+
+def _parts(body: Deformed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return body.vertices, body.normals, body.blocker_vertices
+
+
+def _is_same(a: Deformed, b: Deformed) -> bool:
+    return all(np.array_equal(one, other) for one, other in zip(_parts(a), _parts(b), strict=True))
