@@ -1,6 +1,6 @@
 """How far a frame is from ray-traced visibility: `python -m benchmarks.accuracy`.
 
-Bowling, falling and statues, one frame each, direct light of an environment of order 4, every pixel's centre against
+Bowling, falling and statues, cloth and figure, which deform, one frame each, direct light of an environment of order 4, every pixel's centre against
 brute-force ray casting from the same point in the same environment. The reference is scaled to a mean luminance of 0.5
 and both are clamped to [0, 1].
 """
@@ -16,11 +16,11 @@ import numpy as np
 from PIL import Image
 
 import warp_psf as psf
-from tests.oracles import traced_irradiance, world_triangles
+from tests.oracles import loose_triangles, traced_irradiance, world_triangles
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # Simulated seconds at which each scene is compared: bodies in the air, lying and standing.
-MOMENTS = {"bowling": 2.0, "falling": 2.5, "statues": 1.0}
+MOMENTS = {"bowling": 2.0, "falling": 2.5, "statues": 1.0, "cloth": 2.0, "figure": 1.5}
 # A vertex this close to the floor touches it, metres.
 TOUCH = 0.002
 
@@ -53,7 +53,7 @@ def render(model, data, environment: psf.Environment, size: tuple[int, int], **o
         model, size[1], size[0], environment=environment, bounces=0, model_lights=False, **options
     ) as renderer:
         renderer.update_scene(data, camera="front")
-        layers = renderer.layers()
+        layers = renderer.layers() | {"loose": loose_triangles(renderer)}
         pose = renderer.world_from_camera
         fovy = model.cam_fovy[model.camera("front").id]
     return layers | {"points": pixel_points(layers["depth"], pose, np.deg2rad(fovy))}
@@ -92,7 +92,8 @@ def compare(model, data, environment: psf.Environment, size: tuple[int, int], re
     seen = layers["segmentation"][..., 0] >= 0
     points, normals = layers["points"][seen], layers["normal"][seen]
     if "irradiance" not in reference:
-        reference["irradiance"] = traced_irradiance(model, data, points, normals, environment.project(4))
+        light = environment.project(4)
+        reference["irradiance"] = traced_irradiance(model, data, points, normals, light, loose=layers["loose"])
     expected = layers["albedo"][seen] / np.pi * reference["irradiance"]
     scale = 0.5 / (expected @ LUMINANCE).mean()
     ours = np.clip(layers["direct"][seen] * scale, 0, 1)

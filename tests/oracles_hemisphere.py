@@ -15,17 +15,16 @@ from warp_psf.scene.topology import area_vectors
 from warp_psf.shade.hemisphere import (
     ORIGIN_OFFSET,
     SEEN,
-    BlockerTables,
+    HemisphereTables,
     bring_shape,
-    find_planes,
     horizon_of,
     integrate_lobes,
     integrate_masks,
-    is_above,
     make_hemisphere,
     rasterise_masks,
     upload_blockers,
 )
+from warp_psf.shade.rasterise import BlockerTables, find_planes, is_above
 
 # A ray goes on behind a face seen from its back by this share of the blockers' extent: enough for float32.
 NUDGE = 1.0e-6
@@ -370,7 +369,9 @@ class HemisphereRun:
         found = wp.zeros(len(self.itself), dtype=wp.int32, device=self.device)
         frame = seconds(lambda: self.update(vertices, normals))
         draw = seconds(lambda: rasterise_masks(self.state, self.masks, self.device))
-        place = seconds(lambda: launch(_find_planes, count, [self.state.tables], [found], self.device))
+        place = seconds(
+            lambda: launch(_find_planes, count, [self.state.tables, self.state.blocker_tables], [found], self.device)
+        )
         sum_up = seconds(lambda: integrate_masks(self.state, self.masks, self.order, 0, *self.rows[:2], self.device))
         parts = {"rasterisation": draw - place, "integration": sum_up, "transform": place}
         return {name: part / frame for name, part in parts.items()} | {"other": 1.0 - (draw + sum_up) / frame}
@@ -395,23 +396,23 @@ def _make_shade(order: int):
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _find_planes(first: int, blockers: BlockerTables, sums_out: wp.array(dtype=wp.int32)):
+def _find_planes(first: int, body: HemisphereTables, blockers: BlockerTables, sums_out: wp.array(dtype=wp.int32)):
     """The rasteriser without its masks: what is left are the triangles' ways into the vertices' frames."""
     world, vertex = wp.tid()
     vertex += first
-    horizon = horizon_of(world, vertex, blockers)
-    place = blockers[0].blocker_of[vertex]
+    horizon = horizon_of(world, vertex, body)
+    place = body[0].blocker_of[vertex]
     total = int(0)
-    for index in range(blockers[0].first_near[place], blockers[0].first_near[place + 1], wp.static(BATCH)):
-        count = blockers[0].first_near[place + 1] - index
-        planes = find_planes(world, index, count, wp.uint32(0), blockers[0].near, horizon, blockers)
+    for index in range(body[0].first_near[place], body[0].first_near[place + 1], wp.static(BATCH)):
+        count = body[0].first_near[place + 1] - index
+        planes = find_planes(world, 0, index, count, wp.uint32(0), body[0].near, horizon, blockers)
         for lane in range(wp.static(BATCH)):
             total += planes[0, lane] ^ planes[1, lane] ^ planes[2, lane]
     for cluster in range(blockers[0].first_of_cluster.shape[0] - 1):
-        if is_above(world, cluster, horizon, blockers):
+        if is_above(world, 0, cluster, horizon, blockers):
             end = blockers[0].first_of_cluster[cluster + 1]
             for index in range(blockers[0].first_of_cluster[cluster], end, wp.static(BATCH)):
-                planes = find_planes(world, index, end - index, wp.uint32(0), blockers[0].far, horizon, blockers)
+                planes = find_planes(world, 0, index, end - index, wp.uint32(0), blockers[0].far, horizon, blockers)
                 for lane in range(wp.static(BATCH)):
                     total += planes[0, lane] ^ planes[1, lane] ^ planes[2, lane]
     sums_out[vertex] = total

@@ -11,8 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.bake import bake_radiance_field
-from warp_psf.bake.bodies import bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
-from warp_psf.bake.coarse import make_blockers
+from warp_psf.bake.bodies import bake_blockers, bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
 from warp_psf.bake.kept import BakedBody
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import Film, make_film, resolve_pixels
@@ -141,16 +140,18 @@ def set_stage(
             radiance = np.ones(len(light.mesh.faces), np.float32)
             fields[entity] = bake_radiance_field(light.mesh, radiance, order, device=str(device))
     device_scene = upload_scene(scene, 1, device)
-    spheres = upload_spheres(scene, bake_sphere_sets(shapes, str(device), progress), 1, device)
-    occlusion = upload_occlusion(scene, fields, log_fields, spheres.tables, order, 1, device)
+    blockers = [bake_blockers(shape) for shape in shapes]
+    solid = [shape.casts and not own.two_sided for shape, (own, _) in zip(shapes, blockers, strict=True)]
+    spheres = upload_spheres(scene, bake_sphere_sets(shapes, solid, str(device), progress), 1, device)
+    hemispheres = upload_hemispheres(scene, shapes, blockers, order, 1, device)
+    sheets = (hemispheres.sheets, hemispheres.sheet_tables, hemispheres.masks)
+    occlusion = upload_occlusion(scene, fields, log_fields, spheres.tables, *sheets, order, 1, device)
     transfers = _transfers(bodies)
     shining = [(entity, light.radiance) for light, entity in area_lights]
     lighting = upload_lighting(scene, transfers, shining, order, 1, device)
     if environments:
         write_environment(lighting, np.sum([each.project(order) for each in environments], axis=0))
     behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
-
-    blockers = [make_blockers(shape.name, shape.blocker_vertices, shape.blocker_faces) for shape in shapes]
 
     size = settings.width, settings.height
     see_through = any(entity.opacity < 1.0 for entity in scene.entities)
@@ -179,7 +180,7 @@ def set_stage(
         spheres=spheres,
         cuts=_make_cuts(spheres, surfaces, vertices, bounces, device),
         lighting=lighting,
-        hemispheres=upload_hemispheres(scene, shapes, blockers, order, 1, device),
+        hemispheres=hemispheres,
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
         surfaces=surfaces,
         film=make_film(1, *size, behind, device),

@@ -9,13 +9,17 @@ from queue import SimpleQueue
 from threading import Event
 from typing import TypeVar
 
+import numpy as np
+
 from warp_psf.bake.body import bake_mesh
+from warp_psf.bake.coarse import make_blockers
 from warp_psf.bake.kept import BakedBody
 from warp_psf.bake.logarithm import bake_logarithm
 from warp_psf.bake.radiance import BakedRadiance, bake_radiance
 from warp_psf.bake.shape import shape_key, unit_shape
 from warp_psf.bake.sphere_set import bake_shape_spheres
 from warp_psf.device import core_count, find_device
+from warp_psf.field.blockers import BlockerSet
 from warp_psf.field.shells import ShadowField
 from warp_psf.field.spheres import SphereSet
 from warp_psf.scene.deforming import DeformingShape
@@ -26,6 +30,8 @@ from warp_psf.scene.scene import Scene
 # Boxes whose shortest side is less than this share of the longest are floors, walls and beams: shells around their
 # centre would serve badly what lies on them, so that their light leaves through textured faces instead.
 THICK = 0.25
+# Of a deforming sheet as other bodies see it: every receiver looks at all of these triangles.
+SHEET_TRIANGLES = 160
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
 
@@ -84,8 +90,19 @@ def bake_logarithms(scene: Scene, bodies: list[BakedBody], progress: Progress) -
     return logarithms
 
 
-def bake_sphere_sets(shapes: Sequence[DeformingShape], device: str, progress: Progress) -> tuple[SphereSet | None, ...]:
-    """The blocker spheres of shapes that deform, bound to their vertices; None for one without a surface."""
+def bake_blockers(shape: DeformingShape) -> tuple[BlockerSet, BlockerSet]:
+    """The triangles that hide a deforming body from itself, and the fewer ones that hide others from the light."""
+    # A body that is not in order at the start has nothing that could be told apart.
+    faces = shape.blocker_faces if shape.casts else shape.blocker_faces[:0]
+    vertices = shape.blocker_vertices if shape.casts else np.zeros_like(shape.blocker_vertices)
+    own = make_blockers(shape.name, vertices, faces)
+    return own, make_blockers(shape.name, vertices, faces, coarse=SHEET_TRIANGLES)
+
+
+def bake_sphere_sets(
+    shapes: Sequence[DeformingShape], solid: Sequence[bool], device: str, progress: Progress
+) -> tuple[SphereSet | None, ...]:
+    """The blocker spheres of shapes that deform and are solid, bound to their vertices; None for the others."""
 
     def bake(shape: DeformingShape) -> SphereSet:
         progress(f"fitting spheres to {shape.name}", 0.0)
@@ -93,7 +110,7 @@ def bake_sphere_sets(shapes: Sequence[DeformingShape], device: str, progress: Pr
         progress(f"fitting spheres to {shape.name}", 1.0)
         return spheres
 
-    return tuple(bake(shape) if shape.casts else None for shape in shapes)
+    return tuple(bake(shape) if chosen else None for shape, chosen in zip(shapes, solid, strict=True))
 
 
 def _casting(scene: Scene, casts: list[bool]) -> list[int]:

@@ -204,7 +204,7 @@ def cover(covered: mask, table: wp.array(dtype=mask), planes: batch) -> mask:
 
 @cache
 def make_masks(order: int) -> SimpleNamespace:
-    """Device functions that integrate what a mask leaves open against `order` bands: `open_transfer`, `open_lobe`."""
+    """Device functions that integrate masks against `order` bands: `open_transfer`, `open_lobe`, `blocked_vector`."""
     count = order * order
     pair = wp.types.matrix((2, count), wp.float32)
     vec = sh.make_sh(order).vec
@@ -217,7 +217,12 @@ def make_masks(order: int) -> SimpleNamespace:
     def open_lobe(covered: mask, normal: wp.vec3, mirrored: wp.vec3, exponent: float, masks: MaskTables) -> vec:
         """The same with the cosine and the normalised Phong lobe about a direction `mirrored`."""
 
-    return SimpleNamespace(vec=vec, pair=pair, open_transfer=open_transfer, open_lobe=open_lobe)
+    @wp.func_native(_blocked_snippet(order))
+    def blocked_vector(covered: mask, normal: wp.vec3, masks: MaskTables) -> vec:
+        """Integrals over what is blocked of basis functions about the world's axes: the coverage as an SH vector."""
+
+    functions = {"open_transfer": open_transfer, "open_lobe": open_lobe, "blocked_vector": blocked_vector}
+    return SimpleNamespace(vec=vec, pair=pair, **functions)
 
 
 def upload_masks(order: int, device: wp.Device) -> wp.array:
@@ -242,31 +247,44 @@ def upload_masks(order: int, device: wp.Device) -> wp.array:
     return upload_tables([table], MaskTable, device)
 
 
-def _transfer_snippet(order: int) -> str:
-    """C++: of each block all, or what of its pixels is open, whichever is fewer: themselves, or all but the others."""
-    count = order * order
+def _sums_snippet(order: int, wanted: str, first: int, size: int) -> str:
+    """C++: `sums` of integrals over the wanted pixels. Of each block those that are wanted, or all less the others,
+    whichever are fewer.
+
+    wanted: the word of their bits. first, size: which of the integrals of a pixel are summed, and how many.
+    """
+    stride = 2 * order * order
     return f"""
     const auto& table = masks.data[0];
-    float sums[{2 * count}] = {{}};
+    float sums[{size}] = {{}};
     for (int word = 0; word < {WORDS}; ++word) {{
-        const uint64_t inside = table.inside.data[word];
+        const uint64_t inside = table.inside.data[word], bits = {wanted};
+        if (bits == 0) continue;
         for (int part = 0; part < {WORD_BLOCKS}; ++part) {{
-            const uint64_t all = (inside >> (16 * part)) & 0xffff, blocked = (covered[word] >> (16 * part)) & 0xffff;
-            if (blocked == all) continue;
+            const uint64_t all = (inside >> (16 * part)) & 0xffff, chosen = (bits >> (16 * part)) & 0xffff;
+            if (chosen == 0) continue;
             const int block = {WORD_BLOCKS} * word + part;
-            const bool mostly = 2 * wp::bit_count(blocked) > wp::bit_count(all);
-            const float sign = mostly ? 1.0f : -1.0f;
-            if (!mostly) {{
-                const float* values = table.blocks.data + {2 * count} * block;
-                for (int i = 0; i < {2 * count}; ++i) sums[i] += values[i];
+            const bool few = 2 * wp::bit_count(chosen) < wp::bit_count(all);
+            const float sign = few ? 1.0f : -1.0f;
+            if (!few) {{
+                const float* values = table.blocks.data + {stride} * block + {first};
+                for (int i = 0; i < {size}; ++i) sums[i] += values[i];
             }}
-            for (uint64_t left = mostly ? all & ~blocked : blocked; left; left &= left - 1) {{
+            for (uint64_t left = few ? chosen : all & ~chosen; left; left &= left - 1) {{
                 const int pixel = 16 * block + wp::bit_count((left & -left) - 1);
-                const float* values = table.pixels.data + {2 * count} * pixel;
-                for (int i = 0; i < {2 * count}; ++i) sums[i] += sign * values[i];
+                const float* values = table.pixels.data + {stride} * pixel + {first};
+                for (int i = 0; i < {size}; ++i) sums[i] += sign * values[i];
             }}
         }}
     }}
+    """
+
+
+def _transfer_snippet(order: int) -> str:
+    """C++: both integrals over the open pixels."""
+    count = order * order
+    return f"""
+    {_sums_snippet(order, "inside & ~covered[word]", 0, 2 * count)}
     {_axes_snippet()}
     wp::mat_t<2, {count}, float> result;
     for (int row = 0; row < 2; ++row) {{
@@ -274,6 +292,20 @@ def _transfer_snippet(order: int) -> str:
         {_turn_snippet(order)}
         for (int i = 0; i < {count}; ++i) result.data[row][i] = v[i];
     }}
+    return result;
+    """
+
+
+def _blocked_snippet(order: int) -> str:
+    """C++: the integrals without the cosine over the blocked pixels."""
+    count = order * order
+    return f"""
+    {_sums_snippet(order, "covered[word]", count, count)}
+    {_axes_snippet()}
+    float* v = sums;
+    {_turn_snippet(order)}
+    wp::vec_t<{count}, float> result;
+    for (int i = 0; i < {count}; ++i) result[i] = v[i];
     return result;
     """
 

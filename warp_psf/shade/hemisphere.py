@@ -13,16 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_psf.basis.visibility_mask import (
-    BATCH,
-    MaskTables,
-    batch,
-    cover,
-    make_masks,
-    mask,
-    plane_snippet,
-    upload_masks,
-)
+from warp_psf.basis.visibility_mask import BATCH, MaskTable, MaskTables, cover, make_masks, mask, upload_masks
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.blockers import BlockerSet
 from warp_psf.scene.deforming import Deformed, DeformingShape
@@ -30,56 +21,45 @@ from warp_psf.scene.geometry import DeviceScene, GeometryTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.direct import DirectState
+from warp_psf.shade.rasterise import (
+    BlockerTable,
+    BlockerTables,
+    Horizon,
+    bound_clusters,
+    find_planes,
+    is_above,
+    make_blocker_table,
+    make_horizon,
+)
 
 # The origin of a mask leaves the surface by this share of the body's radius, as in the bake of rigid bodies: faces that
 # meet at a vertex then hide what they should of its valleys.
 ORIGIN_OFFSET = 1.0e-3
-# A triangle with less than this volume between unit vectors to its corners is seen edge-on: it spans 1e-6 sr, a
-# thousandth of a pixel, and its planes would be those of rounding.
-EDGE_ON = 2.0e-6
-
 # What has become of a vertex since the body moved: no pixel needs it, one does, and its transfer is known.
 NOT_SEEN, SEEN, DONE = 0, 1, 2
 
 
 @wp.struct
-class BlockerTable:
-    """A deforming body's vertices and what hides it from itself; see `BlockerSet`."""
+class HemisphereTable:
+    """The vertices of a deforming body that are seen, and the triangles near them; see `BlockerSet`."""
 
-    position: wp.array2d(dtype=wp.vec3)  # (world, vertex): of those seen, metres, in the world
+    position: wp.array2d(dtype=wp.vec3)  # (world, vertex), metres, in the world
     normal: wp.array2d(dtype=wp.vec3)  # (world, vertex)
     progress: wp.array2d(dtype=wp.int32)  # (world, vertex): NOT_SEEN, SEEN or DONE
+    masks: wp.array2d(dtype=mask)  # (world, vertex): what is blocked
+    offset: wp.float32  # of a mask's origin from its vertex, metres
     blocker_of: wp.array(dtype=wp.int32)  # (vertex)
-    blocker: wp.array2d(dtype=wp.vec3)  # (world, blocker vertex), metres, in the world
-    faces: wp.array(dtype=wp.vec3i)  # (triangle)
-    far: wp.array(dtype=wp.int32)  # (coarse triangle): all of them
-    first_of_cluster: wp.array(dtype=wp.int32)  # (cluster + 1)
-    lower: wp.array2d(dtype=wp.vec3)  # (world, cluster): corners of its box, metres
-    upper: wp.array2d(dtype=wp.vec3)  # (world, cluster)
     first_near: wp.array(dtype=wp.int32)  # (blocker vertex + 1)
     near: wp.array(dtype=wp.int32)
     first_skip: wp.array(dtype=wp.int32)  # (blocker vertex + 1)
     skip: wp.array(dtype=wp.int32)
-    two_sided: wp.bool
-    offset: wp.float32  # of a mask's origin from its vertex, metres
-    masks: wp.array2d(dtype=mask)  # (world, vertex): what is blocked
 
 
-BlockerTables = wp.array(dtype=BlockerTable)
-
-
-@wp.struct
-class Horizon:
-    """The frame in which a mask is drawn: its origin, and axes the last of which is the normal."""
-
-    origin: wp.vec3
-    tangent: wp.vec3
-    bitangent: wp.vec3
-    normal: wp.vec3
+HemisphereTables = wp.array(dtype=HemisphereTable)
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _mark_seen(first: int, pixels: ReceiverTable, entity: int, geometry: GeometryTables, blockers: BlockerTables):
+def _mark_seen(first: int, pixels: ReceiverTable, entity: int, geometry: GeometryTables, body: HemisphereTables):
     world, slot = wp.tid()
     slot += first
     if pixels.entity[world, slot] != entity:
@@ -87,146 +67,44 @@ def _mark_seen(first: int, pixels: ReceiverTable, entity: int, geometry: Geometr
     corners = geometry[0].faces[geometry[0].first_face[geometry[0].entity_mesh[entity]] + pixels.face[world, slot]]
     for corner in range(3):
         # Several pixels may write the same.
-        if blockers[0].progress[world, corners[corner]] == wp.static(NOT_SEEN):
-            blockers[0].progress[world, corners[corner]] = wp.static(SEEN)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def _bound_clusters(first: int, blockers: BlockerTables):
-    world, cluster = wp.tid()
-    cluster += first
-    lower = wp.vec3(1.0e30, 1.0e30, 1.0e30)
-    upper = -lower
-    for triangle in range(blockers[0].first_of_cluster[cluster], blockers[0].first_of_cluster[cluster + 1]):
-        corners = blockers[0].faces[triangle]
-        for corner in range(3):
-            place = blockers[0].blocker[world, corners[corner]]
-            lower = wp.min(lower, place)
-            upper = wp.max(upper, place)
-    blockers[0].lower[world, cluster] = lower
-    blockers[0].upper[world, cluster] = upper
+        if body[0].progress[world, corners[corner]] == wp.static(NOT_SEEN):
+            body[0].progress[world, corners[corner]] = wp.static(SEEN)
 
 
 @wp.func
-def horizon_of(world: int, vertex: int, blockers: BlockerTables) -> Horizon:
-    horizon = Horizon()
-    n = blockers[0].normal[world, vertex]
-    level = wp.sqrt(n[0] * n[0] + n[1] * n[1])
-    x = wp.where(level > 1.0e-6, n[0] / level, 1.0)
-    y = wp.where(level > 1.0e-6, n[1] / level, 0.0)
-    horizon.origin = blockers[0].position[world, vertex] + blockers[0].offset * n
-    horizon.tangent = wp.vec3(n[2] * x, n[2] * y, -level)
-    horizon.bitangent = wp.vec3(-y, x, 0.0)
-    horizon.normal = n
-    return horizon
-
-
-def _planes_snippet() -> str:
-    """C++: the corners of a batch fetched one by one, then all of the batch side by side."""
-    edges = [("a", "b", 0), ("b", "c", 1), ("c", "a", 2)]
-    crosses = "".join(
-        f"""
-        const float x_{k} = side * ({p}y * {q}z - {p}z * {q}y), y_{k} = side * ({p}z * {q}x - {p}x * {q}z);
-        const float z_{k} = side * ({p}x * {q}y - {p}y * {q}x);
-        int plane_{k};
-        {plane_snippet(f"x_{k}", f"y_{k}", f"z_{k}", f"plane_{k}")}
-        found.data[{k}][lane] = hides ? plane_{k} : 0;
-        """
-        for p, q, k in edges
-    )
-    corners = "".join(
-        f"""
-        const float {p}u = corners[{3 * k}][lane], {p}v = corners[{3 * k + 1}][lane], {p}w = corners[{3 * k + 2}][lane];
-        const float {p}x = t[0] * {p}u + t[1] * {p}v + t[2] * {p}w, {p}y = s[0] * {p}u + s[1] * {p}v + s[2] * {p}w;
-        const float {p}z = n[0] * {p}u + n[1] * {p}v + n[2] * {p}w;
-        const float {p}{p} = {p}x * {p}x + {p}y * {p}y + {p}z * {p}z;
-        """
-        for k, p in enumerate("abc")
-    )
-    return f"""
-    const auto& table = blockers.data[0];
-    const wp::vec3* places = table.blocker.data + world * table.blocker.shape[1];
-    const wp::vec3 o = horizon.origin, t = horizon.tangent, s = horizon.bitangent, n = horizon.normal;
-    float corners[9][{BATCH}];
-    bool drawn[{BATCH}];
-    for (int lane = 0; lane < {BATCH}; ++lane) {{
-        drawn[lane] = lane < count && !(skipped >> lane & 1u);
-        const int triangle = list.data[lane < count ? first + lane : first];
-        for (int corner = 0; corner < 3; ++corner)
-            for (int axis = 0; axis < 3; ++axis)
-                corners[3 * corner + axis][lane] = places[table.faces.data[triangle][corner]][axis] - o[axis];
-    }}
-    const bool two_sided = table.two_sided;
-    wp::mat_t<3, {BATCH}, int> found;
-    for (int lane = 0; lane < {BATCH}; ++lane) {{
-        {corners}
-        const float volume = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx);
-        const float side = volume > 0.0f ? 1.0f : -1.0f;
-        const bool faces = two_sided | (volume < 0.0f);
-        const bool spans = volume * volume > {EDGE_ON**2:.9e}f * aa * bb * cc;
-        const bool hides = drawn[lane] & ((az > 0.0f) | (bz > 0.0f) | (cz > 0.0f)) & faces & spans;
-        {crosses}
-    }}
-    return found;
-    """
-
-
-@wp.func_native(_planes_snippet())
-def find_planes(
-    world: int,
-    first: int,
-    count: int,
-    skipped: wp.uint32,
-    list: wp.array(dtype=wp.int32),
-    horizon: Horizon,
-    blockers: BlockerTables,
-) -> batch:
-    """The planes above which triangles lie as they are seen from the origin; zeros for those that hide nothing.
-
-    They are the `count` triangles from `first` on in a list, at most a batch of them, less those whose bits are set in
-    `skipped`. Nothing is hidden by triangles below the horizon, by those seen edge-on, and by the backs of a closed
-    surface, whose front hides as much. What lies above three planes is the image, wherever the horizon cuts it.
-    """
-
-
-@wp.func
-def is_above(world: int, cluster: int, horizon: Horizon, blockers: BlockerTables) -> bool:
-    """Whether any of a cluster's box rises above the horizon."""
-    lower = blockers[0].lower[world, cluster]
-    upper = blockers[0].upper[world, cluster]
-    n = horizon.normal
-    reach = wp.dot(wp.vec3(wp.abs(n[0]), wp.abs(n[1]), wp.abs(n[2])), upper - lower)
-    return wp.dot(n, upper + lower - 2.0 * horizon.origin) + reach > 0.0
+def horizon_of(world: int, vertex: int, body: HemisphereTables) -> Horizon:
+    n = body[0].normal[world, vertex]
+    return make_horizon(body[0].position[world, vertex] + body[0].offset * n, n)
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _rasterise(first: int, blockers: BlockerTables, masks: MaskTables):
+def _rasterise(first: int, body: HemisphereTables, blockers: BlockerTables, masks: MaskTables):
     world, vertex = wp.tid()
     vertex += first
-    if blockers[0].progress[world, vertex] != wp.static(SEEN):
+    if body[0].progress[world, vertex] != wp.static(SEEN):
         return
-    horizon = horizon_of(world, vertex, blockers)
-    place = blockers[0].blocker_of[vertex]
+    horizon = horizon_of(world, vertex, body)
+    place = body[0].blocker_of[vertex]
     covered = mask()
-    for index in range(blockers[0].first_near[place], blockers[0].first_near[place + 1], wp.static(BATCH)):
-        count = blockers[0].first_near[place + 1] - index
-        planes = find_planes(world, index, count, wp.uint32(0), blockers[0].near, horizon, blockers)
+    for index in range(body[0].first_near[place], body[0].first_near[place + 1], wp.static(BATCH)):
+        count = body[0].first_near[place + 1] - index
+        planes = find_planes(world, 0, index, count, wp.uint32(0), body[0].near, horizon, blockers)
         covered = cover(covered, masks[0].planes, planes)
-    skip = int(blockers[0].first_skip[place])
-    last_skip = blockers[0].first_skip[place + 1]
+    skip = int(body[0].first_skip[place])
+    last_skip = body[0].first_skip[place + 1]
     for cluster in range(blockers[0].first_of_cluster.shape[0] - 1):
-        if is_above(world, cluster, horizon, blockers):
+        if is_above(world, 0, cluster, horizon, blockers):
             end = blockers[0].first_of_cluster[cluster + 1]
             for index in range(blockers[0].first_of_cluster[cluster], end, wp.static(BATCH)):
                 # Those that are skipped are in ascending order, as triangles are.
                 skipped = wp.uint32(0)
-                while skip < last_skip and blockers[0].skip[skip] < wp.min(index + wp.static(BATCH), end):
-                    if blockers[0].skip[skip] >= index:
-                        skipped |= wp.uint32(1) << wp.uint32(blockers[0].skip[skip] - index)
+                while skip < last_skip and body[0].skip[skip] < wp.min(index + wp.static(BATCH), end):
+                    if body[0].skip[skip] >= index:
+                        skipped |= wp.uint32(1) << wp.uint32(body[0].skip[skip] - index)
                     skip += 1
-                planes = find_planes(world, index, end - index, skipped, blockers[0].far, horizon, blockers)
+                planes = find_planes(world, 0, index, end - index, skipped, blockers[0].far, horizon, blockers)
                 covered = cover(covered, masks[0].planes, planes)
-    blockers[0].masks[world, vertex] = covered
+    body[0].masks[world, vertex] = covered
 
 
 @cache
@@ -238,7 +116,7 @@ def make_hemisphere(order: int) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module="unique")
     def integrate(
         first: int,
-        blockers: BlockerTables,
+        body: HemisphereTables,
         masks: MaskTables,
         first_row: int,
         transfer_out: wp.array(dtype=vec),  # (row)
@@ -246,20 +124,20 @@ def make_hemisphere(order: int) -> SimpleNamespace:
     ):
         world, vertex = wp.tid()
         vertex += first
-        if blockers[0].progress[world, vertex] != wp.static(SEEN):
+        if body[0].progress[world, vertex] != wp.static(SEEN):
             return
-        blockers[0].progress[world, vertex] = wp.static(DONE)
-        normal = blockers[0].normal[world, vertex]
-        covered = blockers[0].masks[world, vertex]
+        body[0].progress[world, vertex] = wp.static(DONE)
+        normal = body[0].normal[world, vertex]
+        covered = body[0].masks[world, vertex]
         both = kit.open_transfer(covered, normal, masks)
-        row = first_row + world * blockers[0].position.shape[1] + vertex
+        row = first_row + world * body[0].position.shape[1] + vertex
         transfer_out[row] = both[0]
         visibility_out[row] = both[1]
 
     @wp.kernel(enable_backward=False, module="unique")
     def integrate_lobe(
         first: int,
-        blockers: BlockerTables,
+        body: HemisphereTables,
         masks: MaskTables,
         eye: wp.array(dtype=wp.vec3),  # (world), metres
         exponent: float,
@@ -268,23 +146,28 @@ def make_hemisphere(order: int) -> SimpleNamespace:
     ):
         world, vertex = wp.tid()
         vertex += first
-        if blockers[0].progress[world, vertex] != wp.static(DONE):
+        if body[0].progress[world, vertex] != wp.static(DONE):
             return
-        normal = blockers[0].normal[world, vertex]
-        view = wp.normalize(eye[world] - blockers[0].position[world, vertex])
+        normal = body[0].normal[world, vertex]
+        view = wp.normalize(eye[world] - body[0].position[world, vertex])
         mirrored = 2.0 * wp.dot(normal, view) * normal - view
-        row = first_row + world * blockers[0].position.shape[1] + vertex
-        gloss_out[row] = kit.open_lobe(blockers[0].masks[world, vertex], normal, mirrored, exponent, masks)
+        row = first_row + world * body[0].position.shape[1] + vertex
+        gloss_out[row] = kit.open_lobe(body[0].masks[world, vertex], normal, mirrored, exponent, masks)
 
     return SimpleNamespace(vec=vec, integrate=integrate, integrate_lobe=integrate_lobe)
 
 
 @dataclass(frozen=True, eq=False)
 class HemisphereState:
-    """A deforming body on the device: `table` is the one that the array `tables` holds."""
+    """A deforming body on the device.
 
-    table: BlockerTable
+    table, blockers: the tables that the arrays `tables` and `blocker_tables` hold.
+    """
+
+    table: HemisphereTable
     tables: wp.array
+    blockers: BlockerTable
+    blocker_tables: wp.array
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,13 +175,16 @@ class Hemispheres:
     """The deforming bodies of a scene.
 
     states: per entity. exponents: of their Phong lobes, per entity. shapes: what was brought last, per entity.
-    masks: what masks are drawn with, None where nothing deforms.
+    sheets: those that are open. sheet_tables: what hides others of each of these: fewer triangles of the same vertices.
+    masks: what masks are drawn with; an array of none where nothing deforms.
     """
 
     states: dict[int, HemisphereState]
     exponents: dict[int, float]
     shapes: dict[int, Deformed]
-    masks: wp.array | None
+    sheets: tuple[int, ...]
+    sheet_tables: wp.array
+    masks: wp.array
 
 
 def upload_blockers(
@@ -308,26 +194,23 @@ def upload_blockers(
 
     blocker_of: the blocker vertex of each seen vertex, int32 [V]. radius: of the body at rest, metres.
     """
-    table = BlockerTable()
+    table = HemisphereTable()
     shape = (worlds, len(blocker_of))
     table.position = wp.zeros(shape, dtype=wp.vec3, device=device)
     table.normal = wp.zeros(shape, dtype=wp.vec3, device=device)
     table.progress = wp.zeros(shape, dtype=wp.int32, device=device)
+    table.masks = wp.zeros(shape, dtype=mask, device=device)
+    table.offset = ORIGIN_OFFSET * radius
     table.blocker_of = wp.array(blocker_of, dtype=wp.int32, device=device)
-    table.blocker = wp.zeros((worlds, len(blockers.first_near) - 1), dtype=wp.vec3, device=device)
-    table.faces = wp.array(blockers.faces, dtype=wp.vec3i, device=device)
-    clusters = len(blockers.first_of_cluster) - 1
-    table.lower = wp.zeros((worlds, clusters), dtype=wp.vec3, device=device)
-    table.upper = wp.zeros((worlds, clusters), dtype=wp.vec3, device=device)
-    for name in ("first_of_cluster", "first_near", "near", "first_skip"):
+    for name in ("first_near", "near", "first_skip"):
         setattr(table, name, wp.array(getattr(blockers, name), dtype=wp.int32, device=device))
-    table.far = wp.array(np.arange(blockers.first_of_cluster[-1]), dtype=wp.int32, device=device)
     # A kernel may read, but not use, what stands behind the last one.
     table.skip = wp.array(np.append(blockers.skip, -1), dtype=wp.int32, device=device)
-    table.two_sided = blockers.two_sided
-    table.offset = ORIGIN_OFFSET * radius
-    table.masks = wp.zeros(shape, dtype=mask, device=device)
-    return HemisphereState(table, upload_tables([table], BlockerTable, device))
+    of_body = make_blocker_table(
+        blockers, wp.zeros((worlds, len(blockers.first_near) - 1), dtype=wp.vec3, device=device)
+    )
+    tables = upload_tables([table], HemisphereTable, device), upload_tables([of_body], BlockerTable, device)
+    return HemisphereState(table, tables[0], of_body, tables[1])
 
 
 def bring_shape(
@@ -339,9 +222,9 @@ def bring_shape(
     """
     state.table.position.assign(vertices)
     state.table.normal.assign(normals)
-    state.table.blocker.assign(blocker_vertices)
+    state.blockers.place.assign(blocker_vertices)
     state.table.progress.fill_(NOT_SEEN)
-    launch(_bound_clusters, state.table.lower.shape, [state.tables], [], device)
+    bound_clusters(state.blocker_tables, device)
 
 
 def mark_seen(
@@ -353,7 +236,7 @@ def mark_seen(
 
 def rasterise_masks(state: HemisphereState, masks: wp.array, device: wp.Device) -> None:
     """Finds the masks of the vertices that are seen."""
-    launch(_rasterise, state.table.position.shape, [state.tables, masks], [], device)
+    launch(_rasterise, state.table.position.shape, [state.tables, state.blocker_tables, masks], [], device)
 
 
 def integrate_masks(
@@ -391,19 +274,25 @@ def integrate_lobes(
 def upload_hemispheres(
     scene: Scene,
     shapes: Sequence[DeformingShape],
-    blockers: Sequence[BlockerSet],
+    blockers: Sequence[tuple[BlockerSet, BlockerSet]],
     order: int,
     worlds: int,
     device: wp.Device,
 ) -> Hemispheres:
-    """Room for the transfer of a scene's deforming entities; shapes and blockers are given in their order."""
-    entities = scene.deforming
-    states, exponents = {}, {}
-    for entity, shape, of_shape in zip(entities, shapes, blockers, strict=True):
+    """Room for the transfer of a scene's deforming entities.
+
+    shapes, blockers: in their order; of each body what hides it from itself, and the fewer triangles that hide others.
+    """
+    states, exponents, sheets = {}, {}, {}
+    for entity, shape, (own, fewer) in zip(scene.deforming, shapes, blockers, strict=True):
         radius = scene.meshes[scene.entities[entity].mesh].radius
-        states[entity] = upload_blockers(of_shape, shape.blocker_of, radius, worlds, device)
+        states[entity] = upload_blockers(own, shape.blocker_of, radius, worlds, device)
         exponents[entity] = float(scene.entities[entity].lobe.exponent)
-    return Hemispheres(states, exponents, {}, upload_masks(order, device) if entities else None)
+        if own.two_sided:
+            sheets[entity] = make_blocker_table(fewer, states[entity].blockers.place)
+    sheet_tables = upload_tables(list(sheets.values()), BlockerTable, device)
+    masks = upload_masks(order, device) if states else wp.zeros(0, dtype=MaskTable, device=device)
+    return Hemispheres(states, exponents, {}, tuple(sheets), sheet_tables, masks)
 
 
 def bring_shapes(hemispheres: Hemispheres, bodies: Sequence[Deformed | None], device: wp.Device) -> None:
@@ -415,6 +304,7 @@ def bring_shapes(hemispheres: Hemispheres, bodies: Sequence[Deformed | None], de
         hemispheres.shapes[entity] = body
         shape = (np.broadcast_to(part, (state.table.position.shape[0], *part.shape)) for part in _parts(body))
         bring_shape(state, *shape, device)
+    bound_clusters(hemispheres.sheet_tables, device)
 
 
 def find_transfer(

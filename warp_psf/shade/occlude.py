@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_psf.basis.sh_exp import make_sh_exp
 from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
-from warp_psf.shade.coverage import SLAB_SHAPE
+from warp_psf.shade.coverage import SHEET_SHAPE, SLAB_SHAPE
 from warp_psf.shade.fades import Light, before_plane, fade_length, horizon_fade, size_fade, sphere_nearness
 from warp_psf.shade.occluders import make_occluders
 from warp_psf.shade.spheres import CLUSTER, CutTables, make_spheres
@@ -44,7 +44,8 @@ def make_occlude(order: int) -> SimpleNamespace:
     ) -> float:
         """How far an entity can take light from a receiver at p with normal n: 0 not at all, its opacity fully."""
         opacity = o[0].occluders.opacity[entity]
-        if entity == own or opacity <= 0.0:
+        # What is not shown has no radius.
+        if entity == own or opacity <= 0.0 or placed.radius <= 0.0:
             return 0.0
         offset = placed.center - p
         height = wp.dot(n, offset)
@@ -124,7 +125,12 @@ def make_occlude(order: int) -> SimpleNamespace:
         weights = weights_of(entity, own, p, n, placed, light, o)
         if weights[0] <= 0.0:
             return visible
-        return multiply(visible, kit.covered_by(world, entity, p, placed, o), weights)
+        covered = values()
+        if o[0].occluders.shape[entity] == wp.static(SHEET_SHAPE):
+            covered = kit.covered_by_sheet(world, entity, p, n, o)
+        else:
+            covered = kit.covered_by(world, entity, p, placed, o)
+        return multiply(visible, covered, weights)
 
     @wp.func
     def add_entity(

@@ -1,9 +1,11 @@
 """The occluders' tables: what a body covers around a point, or the logarithm of what it leaves visible.
 
+Deforming sheets are rasterised into a visibility mask at every receiver: spheres could not fill them.
 An object occlusion field of a body is turned with it by evaluating its basis functions at directions of the body, and
 a log shadow field by turning its vectors.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -15,13 +17,15 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.directions import quadrature_rows, quadrature_weights
 from warp_psf.basis.sh_exp import make_sh_exp, upload_exponential
+from warp_psf.basis.visibility_mask import MaskTables, make_masks
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.shells import ShadowField, make_fields, upload_fields
 from warp_psf.field.spheres import SphereTables
 from warp_psf.scene.geometry import DeviceScene, Placed, PoseTables
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
-from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
+from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SHEET_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
+from warp_psf.shade.rasterise import BlockerTables, draw_all, make_horizon
 
 # Which of the tables of fields holds what.
 COVERAGE, LOGARITHM = 0, 1
@@ -29,14 +33,14 @@ COVERAGE, LOGARITHM = 0, 1
 
 @cache
 def make_occluders(order: int) -> SimpleNamespace:
-    """Device functions for `order` bands: `covered_by`, `logarithm_of`, and their table."""
+    """Device functions for `order` bands: `covered_by`, `covered_by_sheet`, `logarithm_of`, and their table."""
     kit = make_coverage(order)
     values, half_values = kit.values, kit.half_values
     OccluderTable, FieldTable = kit.OccluderTable, make_fields(order).FieldTable
     evaluate, rotate = sh.make_sh(order).evaluate, sh.make_sh(order).rotate
     logs, vec = make_sh_exp(order), kit.vec
     ExpTable = logs.ExpTable
-    lookup = make_fields(order).lookup_coverage
+    lookup, blocked_vector = make_fields(order).lookup_coverage, make_masks(order).blocked_vector
 
     @wp.struct
     class Occlusion:
@@ -53,6 +57,8 @@ def make_occluders(order: int) -> SimpleNamespace:
         exponential: wp.array(dtype=ExpTable)  # (1)
         added: wp.int32  # entities whose logarithms are added
         spheres: SphereTables
+        sheets: BlockerTables  # (sheet)
+        masks: MaskTables  # (1), or none where there are no sheets
 
     OcclusionTables = wp.array(dtype=Occlusion)
 
@@ -83,6 +89,12 @@ def make_occluders(order: int) -> SimpleNamespace:
             p_slab = wp.transpose(to_world) * (p - origin)
             return kit.slab_coverage(p_slab, o[0].occluders.slab_half[entity], to_world, o[0].quadrature)
         return values()
+
+    @wp.func
+    def covered_by_sheet(world: int, entity: int, p: wp.vec3, n: wp.vec3, o: OcclusionTables) -> values:
+        """The part of the directions above a receiver's horizon that a deforming sheet covers."""
+        hidden = draw_all(world, o[0].occluders.field[entity], make_horizon(p, n), o[0].sheets, o[0].masks)
+        return kit.at_directions(blocked_vector(hidden, n, o[0].masks), o[0].rows[world, entity])
 
     @wp.func
     def logarithm_of(
@@ -128,6 +140,7 @@ def make_occluders(order: int) -> SimpleNamespace:
         Occlusion=Occlusion,
         OcclusionTables=OcclusionTables,
         covered_by=covered_by,
+        covered_by_sheet=covered_by_sheet,
         logarithm_of=logarithm_of,
         turn_basis=turn_basis,
     )
@@ -150,6 +163,9 @@ def upload_occlusion(
     fields: list[ShadowField | None],
     log_fields: list[ShadowField | None] | None,
     spheres: wp.array,
+    sheets: Sequence[int],
+    sheet_tables: wp.array,
+    masks: wp.array,
     order: int,
     worlds: int,
     device: wp.Device,
@@ -161,12 +177,15 @@ def upload_occlusion(
         Boxes are multiplied even so, because their coverage has a closed form and its logarithm has none, and bodies
         that light passes through, whose visibility is 1 minus a share of the coverage.
     spheres: the `SphereTable` of its sphere sets, as an array of one.
+    sheets: the entities that are rasterised. sheet_tables: the `BlockerTable` of each. masks: the `MaskTable` for that,
+        as an array of one.
     """
     kit = make_occluders(order)
     shape_of_rows = (worlds, len(scene.entities), order * order)
     rows = wp.zeros((*shape_of_rows, kit.points // 2), dtype=wp.float32, device=device)
     table = kit.Occlusion()
-    table.occluders, coverage = _upload_occluders(scene, fields, order, device)
+    table.occluders, coverage = _upload_occluders(scene, fields, sheets, order, device)
+    table.sheets, table.masks = sheet_tables, masks
     table.rows = wp.array(ptr=rows.ptr, dtype=kit.half_values, shape=shape_of_rows, device=device, copy=False)
     table.quadrature = quadrature_rows(order, device)
     log_field, distinct = _number_logarithms(scene, log_fields)
@@ -184,14 +203,19 @@ def upload_occlusion(
     return OcclusionState(order, table, tables, *arrays, rows)
 
 
-def _upload_occluders(scene: Scene, fields: list[ShadowField | None], order: int, device: wp.Device) -> tuple[Any, Any]:
+def _upload_occluders(
+    scene: Scene, fields: list[ShadowField | None], sheets: Sequence[int], order: int, device: wp.Device
+) -> tuple[Any, Any]:
     """How each entity is looked up, and in which fields."""
     distinct, number = _distinct(fields)
     shapes = [scene.meshes[entity.mesh] for entity in scene.entities]
     occluders = make_occluders(order).OccluderTable()
     shape = [_shape_of(mesh, field) for mesh, field in zip(shapes, fields, strict=True)]
+    for index, entity in enumerate(sheets):
+        shape[entity], number[entity] = SHEET_SHAPE, index
     occluders.shape = wp.array(shape, dtype=wp.int32, device=device)
-    opacity = [entity.opacity if entity.casts else 0.0 for entity in scene.entities]
+    casts = [entity.casts or index in sheets for index, entity in enumerate(scene.entities)]
+    opacity = [entity.opacity if casts[index] else 0.0 for index, entity in enumerate(scene.entities)]
     occluders.opacity = wp.array(opacity, dtype=wp.float32, device=device)
     occluders.field = wp.array(number, dtype=wp.int32, device=device)
     slabs = [mesh.slab or (np.zeros(3), np.eye(3), np.ones(3)) for mesh in shapes]
