@@ -371,11 +371,9 @@ def test_two_cloths_shadow_one_another(two_cloths):
     light = environment.project(4)
     expected = traced_irradiance(model, data, points, normals, light, loose=loose_triangles(renderer))
     clear = traced_irradiance(model, data, points, normals, light)
-    taken, shadow = clear - found, clear - expected
-    assert (shadow / clear).max() > 0.5
-    # The shadow lies where it should, and is too light: between the spheres of a sheet light comes through.
-    assert np.corrcoef(taken.ravel(), shadow.ravel())[0, 1] > 0.97
-    assert 0.4 < taken.sum() / shadow.sum() < 1.0
+    assert ((clear - expected) / clear).max() > 0.5
+    # A mask errs by 1 %, four bands of one occluder by as much again.
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.02 * clear.max()
 
 
 def test_a_body_s_own_spheres_take_nothing_from_it(two_cloths):

@@ -12,7 +12,7 @@ import warp as wp
 from warp_psf.basis.directions import make_directions
 from warp_psf.shade.slab import make_slab
 
-NO_SHAPE, FIELD_SHAPE, SPHERE_SHAPE, SLAB_SHAPE, SHEET_SHAPE = 0, 1, 2, 3, 4
+NO_SHAPE, FIELD_SHAPE, SPHERE_SHAPE, SLAB_SHAPE = 0, 1, 2, 3
 # A receiver closer to a slab than this share of its half-diagonal counts as lying on its surface: contact leaves
 # receivers a little inside, where the slab would otherwise surround them.
 SLAB_SKIN = 1.0e-5
@@ -31,7 +31,7 @@ def make_coverage(order: int) -> SimpleNamespace:
 
         shape: wp.array(dtype=wp.int32)  # (entity): one of the *_SHAPE constants
         opacity: wp.array(dtype=wp.float32)  # (entity): share of light it stops; 0 for lights and what casts no shadow
-        field: wp.array(dtype=wp.int32)  # (entity): index into the field table, or into that of sheets
+        field: wp.array(dtype=wp.int32)  # (entity): index into the field table
         slab_center: wp.array(dtype=wp.vec3)  # (entity), in the entity's frame
         slab_rotation: wp.array(dtype=wp.mat33)  # (entity), entity_from_slab
         slab_half: wp.array(dtype=wp.vec3)  # (entity), half extents, metres

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_psf.basis.sh_exp import make_sh_exp
 from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
-from warp_psf.shade.coverage import SHEET_SHAPE, SLAB_SHAPE
+from warp_psf.shade.coverage import SLAB_SHAPE
 from warp_psf.shade.fades import Light, before_plane, fade_length, horizon_fade, size_fade, sphere_nearness
 from warp_psf.shade.occluders import make_occluders
 from warp_psf.shade.spheres import CLUSTER, CutTables, make_spheres
@@ -44,8 +44,7 @@ def make_occlude(order: int) -> SimpleNamespace:
     ) -> float:
         """How far an entity can take light from a receiver at p with normal n: 0 not at all, its opacity fully."""
         opacity = o[0].occluders.opacity[entity]
-        # What is not shown has no radius.
-        if entity == own or opacity <= 0.0 or placed.radius <= 0.0:
+        if entity == own or opacity <= 0.0:
             return 0.0
         offset = placed.center - p
         height = wp.dot(n, offset)
@@ -125,12 +124,36 @@ def make_occlude(order: int) -> SimpleNamespace:
         weights = weights_of(entity, own, p, n, placed, light, o)
         if weights[0] <= 0.0:
             return visible
-        covered = values()
-        if o[0].occluders.shape[entity] == wp.static(SHEET_SHAPE):
-            covered = kit.covered_by_sheet(world, entity, p, n, o)
-        else:
-            covered = kit.covered_by(world, entity, p, placed, o)
-        return multiply(visible, covered, weights)
+        return multiply(visible, kit.covered_by(world, entity, p, placed, o), weights)
+
+    @wp.func
+    def pass_sheet(
+        visible: both_values,
+        world: int,
+        sheet: int,
+        own: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        light: Light,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+    ) -> both_values:
+        """Multiplies visibilities with what a deforming sheet leaves."""
+        entity = o[0].sheet_entity[sheet]
+        placed = find_placed(world, entity, geometry, poses)
+        # One that is not shown has no radius.
+        if entity == own or placed.radius <= 0.0:
+            return visible
+        offset = placed.center - p
+        weight = o[0].sheet_opacity[sheet] * size_fade(placed.radius, wp.dot(offset, offset))
+        weight *= horizon_fade(wp.dot(n, offset), placed.radius)
+        if weight <= 0.0:
+            return visible
+        nearer = float(0.0)
+        if light.radius >= 0.0:
+            nearer = sphere_nearness(p, placed.center, placed.radius, light)
+        return multiply(visible, kit.covered_by_sheet(world, sheet, p, n, o), wp.vec2(weight, weight * nearer))
 
     @wp.func
     def add_entity(
@@ -183,6 +206,8 @@ def make_occlude(order: int) -> SimpleNamespace:
         entities = geometry[0].entity_mesh.shape[0]
         for entity in range(entities):
             visible = pass_entity(visible, world, entity, own, p, n, light, geometry, poses, o)
+        for sheet in range(o[0].sheet_entity.shape[0]):
+            visible = pass_sheet(visible, world, sheet, own, p, n, light, geometry, poses, o)
         logarithms = both_logarithms()
         if o[0].added > 0:
             for entity in range(entities):

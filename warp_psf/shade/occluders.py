@@ -24,7 +24,7 @@ from warp_psf.field.spheres import SphereTables
 from warp_psf.scene.geometry import DeviceScene, Placed, PoseTables
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
-from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SHEET_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
+from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
 from warp_psf.shade.rasterise import BlockerTables, draw_all, make_horizon
 
 # Which of the tables of fields holds what.
@@ -58,6 +58,8 @@ def make_occluders(order: int) -> SimpleNamespace:
         added: wp.int32  # entities whose logarithms are added
         spheres: SphereTables
         sheets: BlockerTables  # (sheet)
+        sheet_entity: wp.array(dtype=wp.int32)  # (sheet)
+        sheet_opacity: wp.array(dtype=wp.float32)  # (sheet)
         masks: MaskTables  # (1), or none where there are no sheets
 
     OcclusionTables = wp.array(dtype=Occlusion)
@@ -91,10 +93,10 @@ def make_occluders(order: int) -> SimpleNamespace:
         return values()
 
     @wp.func
-    def covered_by_sheet(world: int, entity: int, p: wp.vec3, n: wp.vec3, o: OcclusionTables) -> values:
+    def covered_by_sheet(world: int, sheet: int, p: wp.vec3, n: wp.vec3, o: OcclusionTables) -> values:
         """The part of the directions above a receiver's horizon that a deforming sheet covers."""
-        hidden = draw_all(world, o[0].occluders.field[entity], make_horizon(p, n), o[0].sheets, o[0].masks)
-        return kit.at_directions(blocked_vector(hidden, n, o[0].masks), o[0].rows[world, entity])
+        hidden = draw_all(world, sheet, make_horizon(p, n), o[0].sheets, o[0].masks)
+        return kit.at_directions(blocked_vector(hidden, n, o[0].masks), o[0].rows[world, o[0].sheet_entity[sheet]])
 
     @wp.func
     def logarithm_of(
@@ -184,8 +186,11 @@ def upload_occlusion(
     shape_of_rows = (worlds, len(scene.entities), order * order)
     rows = wp.zeros((*shape_of_rows, kit.points // 2), dtype=wp.float32, device=device)
     table = kit.Occlusion()
-    table.occluders, coverage = _upload_occluders(scene, fields, sheets, order, device)
+    table.occluders, coverage = _upload_occluders(scene, fields, order, device)
     table.sheets, table.masks = sheet_tables, masks
+    table.sheet_entity = wp.array(list(sheets), dtype=wp.int32, device=device)
+    sheet_opacity = [scene.entities[entity].opacity for entity in sheets]
+    table.sheet_opacity = wp.array(sheet_opacity, dtype=wp.float32, device=device)
     table.rows = wp.array(ptr=rows.ptr, dtype=kit.half_values, shape=shape_of_rows, device=device, copy=False)
     table.quadrature = quadrature_rows(order, device)
     log_field, distinct = _number_logarithms(scene, log_fields)
@@ -203,19 +208,14 @@ def upload_occlusion(
     return OcclusionState(order, table, tables, *arrays, rows)
 
 
-def _upload_occluders(
-    scene: Scene, fields: list[ShadowField | None], sheets: Sequence[int], order: int, device: wp.Device
-) -> tuple[Any, Any]:
+def _upload_occluders(scene: Scene, fields: list[ShadowField | None], order: int, device: wp.Device) -> tuple[Any, Any]:
     """How each entity is looked up, and in which fields."""
     distinct, number = _distinct(fields)
     shapes = [scene.meshes[entity.mesh] for entity in scene.entities]
     occluders = make_occluders(order).OccluderTable()
     shape = [_shape_of(mesh, field) for mesh, field in zip(shapes, fields, strict=True)]
-    for index, entity in enumerate(sheets):
-        shape[entity], number[entity] = SHEET_SHAPE, index
     occluders.shape = wp.array(shape, dtype=wp.int32, device=device)
-    casts = [entity.casts or index in sheets for index, entity in enumerate(scene.entities)]
-    opacity = [entity.opacity if casts[index] else 0.0 for index, entity in enumerate(scene.entities)]
+    opacity = [entity.opacity if entity.casts else 0.0 for entity in scene.entities]
     occluders.opacity = wp.array(opacity, dtype=wp.float32, device=device)
     occluders.field = wp.array(number, dtype=wp.int32, device=device)
     slabs = [mesh.slab or (np.zeros(3), np.eye(3), np.ones(3)) for mesh in shapes]
