@@ -74,6 +74,8 @@ MOVES = (
     Move("black pawn h", "h5", 0.9, 1.6, 0.06),
     Move("white queen", "d6", 1.4, 2.8, 0.19, past=0.15),
 )
+# Seconds in which the light changes.
+DUSK = (1.2, 2.6)
 # Shares of a move: in which a piece rises, and in which it is set down; when it goes, and when it comes back.
 RISE, GO, BACK = 0.28, (0.14, 0.62), (0.6, 0.82)
 
@@ -134,6 +136,15 @@ def environments() -> tuple[psf.Environment, psf.Environment]:
 def environment() -> psf.Environment:
     """The first of the two."""
     return environments()[0]
+
+
+def environment_at(time: float) -> psf.Environment:
+    """The light at a time, seconds: one passes into the other while the queen is on her way."""
+    import warp_psf as psf
+
+    first, second = environments()
+    share = _ease(time, *DUSK)
+    return psf.Environment("dusk", (1.0 - share) * first.radiance + share * second.radiance)
 
 
 def place(field: str) -> np.ndarray:
@@ -216,4 +227,4 @@ def _ease(share: float, first: float, last: float) -> float:
 if __name__ == "__main__":
     from warp_psf.cli import run_simulation
 
-    run_simulation(build, states, name="chess", camera="front", environment=environment(), lights=lights())
+    run_simulation(build, states, name="chess", camera="front", environment=environment_at, lights=lights())

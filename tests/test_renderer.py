@@ -334,3 +334,26 @@ def test_area_lights_hang_on_bodies():
         renderer.update_scene(data, "front")
         sums.append(renderer.layers()["direct"].max())
     assert sums[0] > 2 * sums[1] > 0
+
+
+def test_light_may_change_between_frames():
+    model, data = make_model(SCENE)
+    fresh = {}
+    for name in ("studio", "sunset", None):
+        with psf.Renderer(model, 24, 32, environment=name) as renderer:
+            renderer.update_scene(data, "front")
+            fresh[name] = renderer.layers()
+    with psf.Renderer(model, 24, 32) as renderer:
+        renderer.update_scene(data, "front")
+        for name in ("studio", "sunset", None, "studio"):
+            renderer.environment = name
+            found = renderer.layers()
+            for layer in ("color", "direct", "indirect"):
+                np.testing.assert_array_equal(found[layer], fresh[name][layer], err_msg=f"{name} {layer}")
+        assert renderer.environment is not None and renderer.environment.name == "studio"
+        # What cannot be used changes nothing.
+        with pytest.raises((ValueError, FileNotFoundError), match="nowhere"):
+            renderer.environment = "nowhere"
+        np.testing.assert_array_equal(renderer.layers()["color"], fresh["studio"]["color"])
+    with pytest.raises(RuntimeError, match="closed"):
+        renderer.environment = "studio"

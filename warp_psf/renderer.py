@@ -31,7 +31,18 @@ from warp_psf.film.resolve import read_layers
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.light import Light
 from warp_psf.scene.loose import LooseRoom, make_room
-from warp_psf.stage import Progress, Settings, Stage, draw, place, place_deforming, place_loose, set_stage, take_over
+from warp_psf.stage import (
+    Progress,
+    Settings,
+    Stage,
+    draw,
+    place,
+    place_deforming,
+    place_loose,
+    relight,
+    set_stage,
+    take_over,
+)
 
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
@@ -158,6 +169,18 @@ class Renderer:
         marks that cast no shadows; other changes of it change nothing.
         """
         return self._scene
+
+    @property
+    def environment(self) -> Environment | None:
+        """The light from all around. It may be set anew at any time, to all that a new renderer takes for it."""
+        return self._environment
+
+    @environment.setter
+    def environment(self, value: str | np.ndarray | Environment | None) -> None:
+        stage = self._stage
+        self._environment = load_environment(value)
+        relight(stage, *self._read_environments())
+        self._drawn = False
 
     @property
     def world_from_camera(self) -> np.ndarray:
@@ -308,11 +331,14 @@ class Renderer:
             deforming=shapes,
             loose=room,
         )
+        return set_stage(scene, *self._read_environments(), self._settings, shapes, room, self._progress)
+
+    def _read_environments(self) -> tuple[list[Environment], Environment | None]:
+        """Those whose light adds up, and the one that is seen in the background."""
         environments = [] if self._environment is None else [self._environment]
         if self._model_lights:
             environments += read_image_lights(self._model, self._material_space)
-        background = self._skybox or next(iter(environments), None)
-        return set_stage(scene, environments, background, self._settings, shapes, room, self._progress)
+        return environments, self._skybox or next(iter(environments), None)
 
     def _draw(self) -> Stage:
         """The stage with the layers of the present state."""

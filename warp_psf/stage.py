@@ -14,7 +14,7 @@ from warp_psf.bake import bake_radiance_field
 from warp_psf.bake.bodies import bake_blockers, bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
 from warp_psf.bake.kept import BakedBody
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
-from warp_psf.film.resolve import Film, make_film, resolve_pixels
+from warp_psf.film.resolve import Film, make_film, resolve_pixels, with_background
 from warp_psf.film.tracing import any_seen_from_behind
 from warp_psf.scene.camera import Camera
 from warp_psf.scene.deforming import Deformed, DeformingShape
@@ -149,10 +149,6 @@ def set_stage(
     transfers = _transfers(bodies)
     shining = [(entity, light.radiance) for light, entity in area_lights]
     lighting = upload_lighting(scene, transfers, shining, order, 1, device)
-    if environments:
-        write_environment(lighting, np.sum([each.project(order) for each in environments], axis=0))
-    behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
-
     size = settings.width, settings.height
     see_through = any(entity.opacity < 1.0 for entity in scene.entities)
     surfaces = make_surfaces(1, *size, scene, settings.antialias, see_through, device)
@@ -170,7 +166,7 @@ def set_stage(
         bounces = upload_bounces(scene, radiating, flat, occlusion, functions, 1, device)
         last_gather = make_last_gather(bounces, settings.bounce_threshold, *size, surfaces.slots, device)
         field_bytes["radiance"] = sum({id(b): b.field.nbytes for _, b in filter(None, radiating)}.values())
-    return Stage(
+    stage = Stage(
         settings=settings,
         scene=scene,
         room=room,
@@ -183,7 +179,7 @@ def set_stage(
         hemispheres=hemispheres,
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
         surfaces=surfaces,
-        film=make_film(1, *size, behind, device),
+        film=make_film(1, *size, device),
         lattice=make_lattice(1, surfaces.slots, *size, device),
         received=make_received(surfaces.slots, device),
         bounced=make_received(surfaces.slots, device),
@@ -193,6 +189,17 @@ def set_stage(
         last_gather=last_gather,
         field_bytes=field_bytes,
     )
+    relight(stage, environments, background)
+    return stage
+
+
+def relight(stage: Stage, environments: Sequence[Environment], background: Environment | None) -> None:
+    """Puts a stage into other environments; see `set_stage`."""
+    order = stage.settings.order
+    none = np.zeros((order * order, 3))
+    write_environment(stage.lighting, sum((each.project(order) for each in environments), none))
+    behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
+    stage.film = with_background(stage.film, behind)
 
 
 def place(stage: Stage, poses: Poses, view: Camera, lights: tuple[DeltaLight, ...]) -> None:

@@ -1,7 +1,7 @@
 """From shaded receivers to the layers of a frame."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -130,15 +130,20 @@ def seen_tint(
     )
 
 
-def make_film(worlds: int, width: int, height: int, background: np.ndarray, device: wp.Device) -> Film:
-    """Room for the layers of width x height pixels before a background, radiance float32 [rows, columns, 3]."""
+def make_film(worlds: int, width: int, height: int, device: wp.Device) -> Film:
+    """Room for the layers of width x height pixels, before a black background."""
     table = LayerTable()
     shape = (worlds, width * height)
     for name in ("color", "direct", "indirect", "albedo", "normal"):
         setattr(table, name, wp.zeros(shape, dtype=wp.vec3, device=device))
     table.depth = wp.zeros(shape, dtype=wp.float32, device=device)
     table.segmentation = wp.zeros(shape, dtype=wp.vec2i, device=device)
-    return Film(table, wp.array(background, dtype=wp.vec3, ndim=2, device=device), height, width)
+    return Film(table, wp.zeros((1, 1), dtype=wp.vec3, device=device), height, width)
+
+
+def with_background(film: Film, background: np.ndarray) -> Film:
+    """The film before another background: radiance, float32 [rows, columns, 3]."""
+    return replace(film, background=wp.array(background, dtype=wp.vec3, ndim=2, device=film.background.device))
 
 
 @cache
