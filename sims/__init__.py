@@ -1,4 +1,6 @@
-"""Simulations to render: bowling, falling, statues, room, teapots, figure, cloth, chess; `python -m sims.bowling` renders one.
+"""Simulations to render: bowling, falling, statues, room, teapots, figure, cloth and chess.
+
+`python -m sims.bowling` renders one.
 
 Each of these modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
 `lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import warp_psf as psf
+from benchmarks.accuracy import pixel_points
 from tests.oracles import loose_triangles, make_model, shade_points, traced_irradiance
 from warp_psf.bridge import looks, meet_deforming, read_deformed
 from warp_psf.bridge.deforming import DeformingBody
@@ -403,3 +404,62 @@ def test_a_flex_gone_astray_leaves_the_others(two_cloths):
     renderer.update_scene(data)
     renderer.layers()
     np.testing.assert_array_equal(shade_points(renderer, "lower", points, normals)[0], shadowed)
+
+
+# Their own shadows
+
+
+FOLD_CAMERA = '<camera name="fold" pos="0 -1.1 1.5" xyaxes="1 0 0 0 .8 .6" fovy="35"/>'
+
+
+def folded(slope: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """A cloth of 1 m that is bent into a valley along y, whose sides rise by `slope`."""
+    cloth = GRID.format("cloth", "21 21 1", "0 0 .2", 0.004, 2, 'rgba="1 1 1 1"').replace(".1 .1 .1", ".05 .05 .05")
+    model, data = make_model(cloth + FOLD_CAMERA + '<geom name="speck" size=".001" pos="0 0 -9"/>')
+    model.vis.quality.offsamples = 0
+    data.flexvert_xpos[:, 2] += slope * np.abs(data.flexvert_xpos[:, 0])
+    return model, data
+
+
+def light_on(model, data, **options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the pixels on the cloth receive, [N, 3]; what they should by ray casting; and without any shadow."""
+    environment = psf.Environment.from_coefficients(psf.load_environment("studio").project(4))
+    settings = {"bounces": 0, "environment": environment, "material_space": "linear", "model_lights": False}
+    with psf.Renderer(model, 60, 80, **settings, **options) as renderer:
+        renderer.update_scene(data, "fold")
+        layers, pose, loose = renderer.layers(), renderer.world_from_camera, loose_triangles(renderer)
+    on = layers["segmentation"][..., 1] == KIND.mjOBJ_FLEX
+    points, normals = pixel_points(layers["depth"], pose, np.deg2rad(35))[on], layers["normal"][on]
+    light = environment.project(4)
+    nothing = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    expected, clear = (traced_irradiance(model, data, points, normals, light, loose=each) for each in (loose, nothing))
+    return layers["direct"][on] * np.pi / layers["albedo"][on], expected, clear
+
+
+@pytest.mark.parametrize("slope", [0.8, 1.6])
+@pytest.mark.parametrize("shading", ["pixel", "vertex"])
+def test_a_valley_hides_its_sides_from_each_other(slope, shading):
+    found, expected, clear = light_on(*folded(slope), shading=shading)
+    scale = clear.mean()
+    assert np.sqrt(np.mean((clear - expected) ** 2)) > 0.1 * scale
+    # Masks err by 1 %; pixels at the bottom, where normals turn within an edge, take what vertices around them have.
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.03 * scale
+
+
+def test_what_is_still_keeps_its_transfer_and_what_moves_does_not():
+    model, data = folded(1.0)
+    with psf.Renderer(model, 60, 80, bounces=0) as renderer:
+        renderer.update_scene(data, "fold")
+        first = renderer.layers()["direct"]
+        (state,) = renderer._stage.hemispheres.states.values()
+        done = state.table.progress.numpy().copy()
+        assert 0 < (done == 2).sum() < done.size and not (done == 1).any()
+        renderer.update_scene(data, "fold")
+        np.testing.assert_array_equal(renderer.layers()["direct"], first)
+        np.testing.assert_array_equal(state.table.progress.numpy(), done)
+        data.flexvert_xpos[:, 2] *= 0.5
+        renderer.update_scene(data, "fold")
+        moved = renderer.layers()["direct"]
+    with psf.Renderer(model, 60, 80, bounces=0) as renderer:
+        renderer.update_scene(data, "fold")
+        np.testing.assert_array_equal(renderer.layers()["direct"], moved)
