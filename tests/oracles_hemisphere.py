@@ -7,10 +7,12 @@ import numpy as np
 import warp as wp
 
 from warp_psf.bake.coarse import make_blockers
+from warp_psf.bake.visible_sets import find_visible_sets
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.visibility_mask import BATCH, upload_masks
 from warp_psf.device import find_device, launch
 from warp_psf.field.blockers import BlockerSet
+from warp_psf.scene.deforming import Deformed
 from warp_psf.scene.topology import area_vectors
 from warp_psf.shade.hemisphere import (
     ORIGIN_OFFSET,
@@ -24,7 +26,7 @@ from warp_psf.shade.hemisphere import (
     rasterise_masks,
     upload_blockers,
 )
-from warp_psf.shade.rasterise import BlockerTables, find_planes, is_above
+from warp_psf.field.rasterise import BlockerTables, find_planes, is_above
 
 # A ray goes on behind a face seen from its back by this share of the blockers' extent: enough for float32.
 NUDGE = 1.0e-6
@@ -345,12 +347,10 @@ class HemisphereRun:
     def learn(self, frames: list[np.ndarray], normals: list[np.ndarray]) -> None:
         """From now on only what some vertex position [V, 3] of a recorded motion shows is rasterised."""
         states = [
-            tuple(np.asarray(values, np.float32) for values in (vertices, vertices, normal))
+            Deformed(*(np.asarray(values, np.float32) for values in (vertices, normal, vertices)))
             for vertices, normal in zip(frames, normals, strict=True)
         ]
-        from warp_psf.bake.visible_sets import find_visible_sets
-
-        self._take(find_visible_sets(self.blockers, states, self.itself, offset=self.offset))
+        self._take(find_visible_sets("body", self.blockers, self.itself, states, self.offset))
 
     def stage_shares(self, vertices: np.ndarray, normals: np.ndarray) -> dict[str, float]:
         """Shares of the time of a frame: `rasterisation`, `integration`, `transform` and `other`."""

@@ -20,7 +20,7 @@ ALLOWED = {
     "area_light": {"basis", "scene", "field"},
     "film": {"basis", "scene"},
 }
-SEES_EVERYTHING = {"__init__", "bridge", "stage", "renderer", "viewer", "cli"}
+SEES_EVERYTHING = {"__init__", "bridge", "settings", "stage", "renderer", "viewer", "cli"}
 # What sims may use besides warp_psf.__all__: the command line that they share with `warp-psf render`.
 RUNNER = "warp_psf.cli.run_simulation"
 MAY_IMPORT_MUJOCO = {"bridge", "motion", "renderer"}

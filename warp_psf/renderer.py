@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from numbers import Integral, Real
+from collections.abc import Iterable, Sequence
+from numbers import Integral
 from typing import NoReturn
 
 import mujoco
@@ -25,17 +25,17 @@ from warp_psf.bridge import (
 )
 from warp_psf.bridge.deforming import DeformingBody
 from warp_psf.device import find_device
-from warp_psf.field.radiance import FUNCTION_COUNTS
-from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS, to_display
+from warp_psf.film.display import to_display
 from warp_psf.film.resolve import read_layers
 from warp_psf.scene.environment import Environment, load_environment
 from warp_psf.scene.light import Light
 from warp_psf.scene.loose import LooseRoom, make_room
+from warp_psf.settings import Settings, check_bounces, check_options
 from warp_psf.stage import (
     Progress,
-    Settings,
     Stage,
     draw,
+    learn,
     place,
     place_deforming,
     place_loose,
@@ -44,13 +44,6 @@ from warp_psf.stage import (
     take_over,
 )
 
-ORDERS = (2, 3, 4, 5, 6)
-SHADINGS = ("pixel", "vertex")
-COMPOSITIONS = ("product", "log")
-# A picture of more pixels than this is a mistyped size: its buffers would take over 30 GB.
-MOST_PIXELS = 2**27
-# After so many bounces between white walls a fiftieth of the light is left.
-MOST_BOUNCES = 16
 # Shadow rays towards directional lights end after this many extents of the model.
 DIRECTIONAL_REACH = 1000.0
 
@@ -113,10 +106,10 @@ class Renderer:
         progress: Progress | None = None,
     ):
         _check_model(model)
-        _check_options(height, width, order, compose, shading, exposure, view)
+        check_options(height, width, order, compose, shading, exposure, view)
         if not isinstance(max_geom, Integral) or max_geom < 1:
             raise ValueError(f"max_geom is {max_geom!r}; give a whole number of geoms, at least 1")
-        _check_bounces(bounces, bounce_threshold, basis_functions)
+        check_bounces(bounces, bounce_threshold, basis_functions)
         self._model = model
         self._settings = Settings(
             height=int(height),
@@ -243,6 +236,27 @@ class Renderer:
         place(stage, poses, view, read_delta_lights(self._model, data, stage.scene, view))
         self._world_from_camera = np.eye(4)
         self._world_from_camera[:3, :3], self._world_from_camera[:3, 3] = view.rotation, view.position
+        self._drawn = False
+
+    def learn_motion(self, states: Iterable[mujoco.MjData]) -> None:
+        """Finds out what skins and flexes see of themselves in a recorded motion, so that motion like it costs less.
+
+        states: of the motion; the same `MjData` may come every time, moved on. Where a body later bends as it never did
+        in them, it may lack some of its own shadow. What was learned holds until other geoms are shown, or the model's
+        sizes or colours change. Source: Kautz 2004, section 3.2, potentially visible sets.
+
+        Raises:
+            ValueError: there are no states, or one is of another model.
+        """
+        stage, view = self._stage, mujoco.MjvScene(self._model, self._scene.maxgeom)
+        motion = []
+        for data in states:
+            read_camera(self._model, data, -1)
+            _update_view(view, self._model, data, self._option, find_camera(self._model, -1))
+            motion.append(read_deformed(self._model, view, self._bodies))
+        if not motion:
+            raise ValueError("the motion to learn has no states; give at least one MjData")
+        learn(stage, motion, self._progress)
         self._drawn = False
 
     def render(self, *, out: np.ndarray | None = None) -> np.ndarray:
@@ -405,30 +419,3 @@ def _check_model(model: mujoco.MjModel) -> None:
         raise TypeError(
             f"model is a {type(model).__name__}; give a mujoco.MjModel, for example mujoco.MjModel.from_xml_path(path)"
         )
-
-
-def _check_bounces(bounces: int, threshold: float, functions: int) -> None:
-    if bounces not in range(MOST_BOUNCES + 1):
-        raise ValueError(f"bounces is {bounces!r}; give a whole number from 0 to {MOST_BOUNCES}")
-    if not isinstance(threshold, Real) or not 0.0 < threshold < 1.0:
-        raise ValueError(f"bounce_threshold is {threshold!r}; give a share between 0 and 1")
-    if functions not in FUNCTION_COUNTS:
-        raise ValueError(f"basis_functions is {functions}; choose one of {', '.join(map(str, FUNCTION_COUNTS))}")
-
-
-def _check_options(height: int, width: int, order: int, compose: str, shading: str, exposure: float, view: str) -> None:
-    for name, size in (("height", height), ("width", width)):
-        if not np.isfinite(size) or int(size) != size or size < 1:
-            raise ValueError(f"{name} is {size}; give a whole number of pixels, at least 1")
-    if height * width > MOST_PIXELS:
-        raise ValueError(f"a picture of {width} x {height} pixels is too large; give at most {MOST_PIXELS} pixels")
-    if order not in ORDERS:
-        raise ValueError(f"order is {order}; choose one of {', '.join(map(str, ORDERS))}")
-    if compose not in COMPOSITIONS:
-        raise ValueError(f"compose is {compose!r}; choose {' or '.join(map(repr, COMPOSITIONS))}")
-    if shading not in SHADINGS:
-        raise ValueError(f"shading is {shading!r}; choose {' or '.join(map(repr, SHADINGS))}")
-    if view not in VIEWS:
-        raise ValueError(f"view is {view!r}; choose {' or '.join(map(repr, VIEWS))}")
-    if not abs(exposure) <= LARGEST_EXPOSURE:
-        raise ValueError(f"exposure is {exposure}; give a number of stops within {LARGEST_EXPOSURE:g} of 0")

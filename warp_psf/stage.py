@@ -13,6 +13,7 @@ import warp as wp
 from warp_psf.bake import bake_radiance_field
 from warp_psf.bake.bodies import bake_blockers, bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
 from warp_psf.bake.kept import BakedBody
+from warp_psf.bake.visible_sets import find_visible_sets
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
 from warp_psf.film.resolve import Film, make_film, resolve_pixels, with_background
 from warp_psf.film.tracing import any_seen_from_behind
@@ -25,11 +26,12 @@ from warp_psf.scene.light import DeltaLight, area_light_entities
 from warp_psf.scene.loose import Loose, LooseRoom
 from warp_psf.scene.scene import Poses, Scene
 from warp_psf.scene.tint import TextureTable, upload_textures
+from warp_psf.settings import Settings
 from warp_psf.shade.bounce import BounceState, bounce, gather_basis_irradiances
 from warp_psf.shade.delta import DeltaState, add_delta_lights, make_delta_lights, write_delta_lights
 from warp_psf.shade.direct import DirectState, shade_direct, upload_lighting, write_environment
 from warp_psf.shade.gloss import shade_gloss
-from warp_psf.shade.hemisphere import Hemispheres, bring_shapes, find_transfer, upload_hemispheres
+from warp_psf.shade.hemisphere import Hemispheres, bring_shapes, find_transfer, look_at, upload_hemispheres
 from warp_psf.shade.last_gather import LastGather, gather_last_bounce, make_last_gather
 from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice, refine_lattice
 from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
@@ -40,26 +42,6 @@ from warp_psf.shade.tint import tint_proxies
 
 Progress = Callable[[str, float], None]
 Received = tuple[wp.array, wp.array]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a stage is set up for; see `Renderer` for the meaning of each.
-
-    reach: how far shadow rays towards directional lights go, metres.
-    """
-
-    height: int
-    width: int
-    order: int
-    compose: str
-    shading: str
-    bounces: int
-    bounce_threshold: float
-    basis_functions: int
-    antialias: bool
-    reach: float
-    device: wp.Device
 
 
 @dataclass(frozen=True)
@@ -224,6 +206,19 @@ def place_deforming(stage: Stage, bodies: Sequence[Deformed | None]) -> None:
 def place_loose(stage: Stage, loose: Loose | None) -> None:
     """Brings what has no lasting shape to the device; the stage has a room that holds it."""
     write_loose(stage.device_scene, stage.scene, loose)
+
+
+def learn(stage: Stage, motion: Sequence[Sequence[Deformed | None]], progress: Progress) -> None:
+    """Leaves to the vertices of deforming entities the triangles that they see in some state of a motion."""
+    hemispheres = stage.hemispheres
+    for index, (entity, state) in enumerate(hemispheres.states.items()):
+        states = [shown for bodies in motion if (shown := bodies[index]) is not None]
+        if states:
+            name, device = stage.scene.entities[entity].name, stage.settings.device
+            offset, blocker_of = float(state.table.offset), state.table.blocker_of.numpy()
+            how = {"device": str(device), "progress": progress}
+            sets = find_visible_sets(name, hemispheres.triangles[entity], blocker_of, states, offset, **how)
+            look_at(hemispheres, entity, sets, device)
 
 
 def take_over(stage: Stage, before: Stage) -> None:

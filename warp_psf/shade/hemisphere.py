@@ -6,7 +6,7 @@ bake; from there on a deforming body is shaded as they are.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -16,12 +16,7 @@ import warp as wp
 from warp_psf.basis.visibility_mask import BATCH, MaskTable, MaskTables, cover, make_masks, mask, upload_masks
 from warp_psf.device import launch, upload_tables
 from warp_psf.field.blockers import BlockerSet
-from warp_psf.scene.deforming import Deformed, DeformingShape
-from warp_psf.scene.geometry import DeviceScene, GeometryTables
-from warp_psf.scene.receiver import ReceiverTable
-from warp_psf.scene.scene import Scene
-from warp_psf.shade.direct import DirectState
-from warp_psf.shade.rasterise import (
+from warp_psf.field.rasterise import (
     BlockerTable,
     BlockerTables,
     Horizon,
@@ -31,6 +26,11 @@ from warp_psf.shade.rasterise import (
     make_blocker_table,
     make_horizon,
 )
+from warp_psf.scene.deforming import Deformed, DeformingShape
+from warp_psf.scene.geometry import DeviceScene, GeometryTables
+from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.scene import Scene
+from warp_psf.shade.direct import DirectState
 
 # The origin of a mask leaves the surface by this share of the body's radius, as in the bake of rigid bodies: faces that
 # meet at a vertex then hide what they should of its valleys.
@@ -161,9 +161,11 @@ def make_hemisphere(order: int) -> SimpleNamespace:
 class HemisphereState:
     """A deforming body on the device.
 
+    radius: of the body at rest, metres.
     table, blockers: the tables that the arrays `tables` and `blocker_tables` hold.
     """
 
+    radius: float
     table: HemisphereTable
     tables: wp.array
     blockers: BlockerTable
@@ -174,12 +176,14 @@ class HemisphereState:
 class Hemispheres:
     """The deforming bodies of a scene.
 
-    states: per entity. exponents: of their Phong lobes, per entity. shapes: what was brought last, per entity.
+    states, and per entity: triangles, all that its vertices may look at; exponents, of their Phong lobes; shapes, what
+    was brought last.
     sheets: those that are open. sheet_tables: what hides others of each of these: fewer triangles of the same vertices.
     masks: what masks are drawn with; an array of none where nothing deforms.
     """
 
     states: dict[int, HemisphereState]
+    triangles: dict[int, BlockerSet]
     exponents: dict[int, float]
     shapes: dict[int, Deformed]
     sheets: tuple[int, ...]
@@ -210,7 +214,7 @@ def upload_blockers(
         blockers, wp.zeros((worlds, len(blockers.first_near) - 1), dtype=wp.vec3, device=device)
     )
     tables = upload_tables([table], HemisphereTable, device), upload_tables([of_body], BlockerTable, device)
-    return HemisphereState(table, tables[0], of_body, tables[1])
+    return HemisphereState(radius, table, tables[0], of_body, tables[1])
 
 
 def bring_shape(
@@ -283,16 +287,28 @@ def upload_hemispheres(
 
     shapes, blockers: in their order; of each body what hides it from itself, and the fewer triangles that hide others.
     """
-    states, exponents, sheets = {}, {}, {}
+    states, triangles, exponents, sheets = {}, {}, {}, {}
     for entity, shape, (own, fewer) in zip(scene.deforming, shapes, blockers, strict=True):
         radius = scene.meshes[scene.entities[entity].mesh].radius
         states[entity] = upload_blockers(own, shape.blocker_of, radius, worlds, device)
+        triangles[entity] = own
         exponents[entity] = float(scene.entities[entity].lobe.exponent)
         if own.two_sided:
             sheets[entity] = make_blocker_table(fewer, states[entity].blockers.place)
     sheet_tables = upload_tables(list(sheets.values()), BlockerTable, device)
     masks = upload_masks(order, device) if states else wp.zeros(0, dtype=MaskTable, device=device)
-    return Hemispheres(states, exponents, {}, tuple(sheets), sheet_tables, masks)
+    return Hemispheres(states, triangles, exponents, {}, tuple(sheets), sheet_tables, masks)
+
+
+def look_at(hemispheres: Hemispheres, entity: int, triangles: BlockerSet, device: wp.Device) -> None:
+    """From now on the vertices of an entity look at other triangles of the same body."""
+    state = hemispheres.states[entity]
+    worlds, blocker_of = state.table.position.shape[0], state.table.blocker_of.numpy()
+    changed = upload_blockers(triangles, blocker_of, state.radius, worlds, device)
+    changed.blockers.place = state.blockers.place  # which a sheet's other table shares
+    blocker_tables = upload_tables([changed.blockers], BlockerTable, device)
+    hemispheres.states[entity] = replace(changed, blocker_tables=blocker_tables)
+    hemispheres.shapes.pop(entity, None)
 
 
 def bring_shapes(hemispheres: Hemispheres, bodies: Sequence[Deformed | None], device: wp.Device) -> None:

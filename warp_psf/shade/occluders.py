@@ -19,13 +19,13 @@ from warp_psf.basis.directions import quadrature_rows, quadrature_weights
 from warp_psf.basis.sh_exp import make_sh_exp, upload_exponential
 from warp_psf.basis.visibility_mask import MaskTables, make_masks
 from warp_psf.device import launch, upload_tables
+from warp_psf.field.rasterise import BlockerTables, draw_all, make_horizon
 from warp_psf.field.shells import ShadowField, make_fields, upload_fields
 from warp_psf.field.spheres import SphereTables
 from warp_psf.scene.geometry import DeviceScene, Placed, PoseTables
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.coverage import FIELD_SHAPE, NO_SHAPE, SLAB_SHAPE, SPHERE_SHAPE, make_coverage
-from warp_psf.shade.rasterise import BlockerTables, draw_all, make_horizon
 
 # Which of the tables of fields holds what.
 COVERAGE, LOGARITHM = 0, 1
