@@ -312,7 +312,7 @@ class HemisphereRun:
     ) -> "HemisphereRun":
         """A body at rest: [V, 3] twice, faces [F, 3]; `coarse` triangles afar, None for all of the fine ones."""
         blockers = make_blockers("body", vertices, faces, coarse=coarse or len(faces))
-        return cls(blockers, vertices, order, len(blockers.faces) - len(faces) if coarse else 0)
+        return cls(blockers, vertices, order, int(blockers.first_of_cluster[-1]) if coarse else 0)
 
     def update(self, vertices: np.ndarray, normals: np.ndarray) -> None:
         """One frame, from the positions on the host to the shaded vertices, for all vertices."""

@@ -69,6 +69,16 @@ def coarse_faces(blockers: BlockerSet) -> np.ndarray:
     return blockers.faces[: coarse_count(blockers)]
 
 
+def first_fine(blockers: BlockerSet) -> int:
+    return int(blockers.first_of_level[-2])
+
+
+def lists_of(blockers: BlockerSet, vertex: int) -> tuple[np.ndarray, np.ndarray]:
+    """The near triangles of a vertex, and the coarse ones that it skips."""
+    near = blockers.near[blockers.first_near[vertex] : blockers.first_near[vertex + 1]]
+    return near, blockers.skip[blockers.first_skip[vertex] : blockers.first_skip[vertex + 1]]
+
+
 def part_of(vertices, faces):
     return find_components(len(vertices), faces[:, :2].ravel(), faces[:, 1:].ravel())
 
@@ -88,10 +98,34 @@ def test_arrays_are_what_the_contract_says(made):
     name, vertices, faces, blockers = made
     for array in (blockers.coarse_of, blockers.near, blockers.skip, blockers.first_near, blockers.first_skip):
         assert array.dtype == np.int32 and array.ndim == 1
-    assert blockers.faces.dtype == blockers.first_of_cluster.dtype == np.int32
-    np.testing.assert_array_equal(blockers.faces[coarse_count(blockers) :], faces)
+    for array in (blockers.faces, blockers.first_of_cluster, blockers.parent, blockers.first_of_level):
+        assert array.dtype == np.int32
+    np.testing.assert_array_equal(blockers.faces[first_fine(blockers) :], faces)
     assert len(blockers.first_near) == len(blockers.first_skip) == len(vertices) + 1
     assert blockers.two_sided == SHAPES[name][2]
+
+
+def test_every_triangle_has_one_of_the_level_above_that_stands_for_it(made):
+    _, vertices, faces, blockers = made
+    first, parent = blockers.first_of_level, blockers.parent
+    assert first[0] == 0 and first[1] == coarse_count(blockers) and first[-1] == len(blockers.faces) == len(parent)
+    assert (parent[: first[1]] == -1).all()
+    of_fine = np.arange(first[-2], first[-1])
+    for level in range(len(first) - 2, 0, -1):
+        # Each of those above stands for some, and the last steps lead to the coarse ones.
+        above = np.unique(parent[first[level] : first[level + 1]])
+        np.testing.assert_array_equal(above, np.arange(first[level - 1], first[level]))
+        of_fine = parent[of_fine]
+    np.testing.assert_array_equal(of_fine, blockers.coarse_of)
+    part = part_of(vertices, faces)
+    lower = blockers.faces[first[1] :]
+    np.testing.assert_array_equal(part[lower[:, 0]], part[blockers.faces[parent[first[1] :], 0]])
+
+
+def test_levels_are_steps_of_about_one_size(made):
+    count = np.diff(made[3].first_of_level)
+    # Steps of four where there is room for them: one less is cut at half a step.
+    assert (count[1:] > 2.0 * count[:-1]).all() and (count[1:] < 8.5 * count[:-1]).all()
 
 
 def test_there_are_about_as_many_coarse_triangles_as_asked_for(made):
@@ -127,14 +161,20 @@ def test_every_fine_triangle_has_one_that_stands_for_it(made):
     assert area[(normal * other).sum(axis=1) < 0.0].sum() < 0.03 * area.sum()
 
 
-def test_near_is_what_the_skipped_stand_for(made):
+def test_near_and_far_cover_the_surface_once(made):
     _, vertices, _, blockers = made
-    count = coarse_count(blockers)
+    fine = np.arange(first_fine(blockers), len(blockers.faces))
+    lineage = [fine]
+    for _ in range(len(blockers.first_of_level) - 2):
+        lineage.append(blockers.parent[lineage[-1]])
     for vertex in range(0, len(vertices), 7):
-        skip = blockers.skip[blockers.first_skip[vertex] : blockers.first_skip[vertex + 1]]
-        near = blockers.near[blockers.first_near[vertex] : blockers.first_near[vertex + 1]]
-        assert (np.diff(skip) > 0).all()
-        np.testing.assert_array_equal(np.sort(near), count + np.flatnonzero(np.isin(blockers.coarse_of, skip)))
+        near, skip = lists_of(blockers, vertex)
+        assert (np.diff(near) > 0).all() and (np.diff(skip) > 0).all()
+        assert (near >= coarse_count(blockers)).all() and (skip < coarse_count(blockers)).all()
+        used = np.ones(coarse_count(blockers), bool)
+        used[skip] = False
+        used = np.concatenate([used, np.isin(np.arange(coarse_count(blockers), len(blockers.faces)), near)])
+        assert (sum(used[each].astype(int) for each in lineage) == 1).all()
 
 
 def test_triangles_around_a_vertex_are_near(made):
@@ -143,8 +183,38 @@ def test_triangles_around_a_vertex_are_near(made):
         next_to = np.unique(faces[(faces == vertex).any(axis=1)])
         next_to = np.unique(faces[np.isin(faces, next_to).any(axis=1)])
         around = np.flatnonzero(np.isin(faces, next_to).any(axis=1))
-        near = blockers.near[blockers.first_near[vertex] : blockers.first_near[vertex + 1]]
-        assert np.isin(coarse_count(blockers) + around, near).all()
+        near, _ = lists_of(blockers, vertex)
+        assert np.isin(first_fine(blockers) + around, near).all()
+
+
+def test_neighbours_are_at_most_one_level_apart(made):
+    _, vertices, faces, blockers = made
+    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    key = ends[:, 0] * len(vertices) + ends[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
+    one, other = order[same] // 3, order[same + 1] // 3
+    for vertex in range(0, len(vertices), 97):
+        near, _ = lists_of(blockers, vertex)
+        # The level at which each fine triangle is looked at.
+        depth, triangle = np.zeros(len(faces), int), np.arange(first_fine(blockers), len(blockers.faces))
+        for level in range(len(blockers.first_of_level) - 2, 0, -1):
+            depth[np.isin(triangle, near)] = level
+            triangle = blockers.parent[triangle]
+        # What stands for neighbours shares an edge itself, but where the closest triangle is one farther on.
+        assert np.mean(np.abs(depth[one] - depth[other]) > 1) < 0.01
+
+
+def test_what_is_near_does_not_grow_with_the_surface():
+    # Of 2, 8 and 32 thousand triangles at 400 coarse ones: 84, 115 and 141. Two levels would make for 84, 234 and 748.
+    near = []
+    for cells in (13, 26, 52):
+        blockers = make_blockers("ball", *ball(cells=cells, diameter=2.0), coarse=400)
+        near.append(np.diff(blockers.first_near))
+    one, other, last = (counts.mean() for counts in near)
+    # Each level adds its own ring around a vertex.
+    assert other - one < 40.0 and last - other < 40.0
+    assert max(counts.max() for counts in near) < 250
 
 
 def test_clusters_are_small_and_of_one_part(made):
@@ -210,8 +280,7 @@ def measure(vertices, faces, blockers, count=80):
     found = []
     for vertex, frame in zip(chosen, frames, strict=True):
         origin = vertices[vertex] + offset * normals[vertex]
-        skip = blockers.skip[blockers.first_skip[vertex] : blockers.first_skip[vertex + 1]]
-        near = blockers.near[blockers.first_near[vertex] : blockers.first_near[vertex + 1]]
+        near, skip = lists_of(blockers, vertex)
         used = np.concatenate([near, np.setdiff1d(np.arange(coarse_count(blockers)), skip)])
         two, all_of = (
             blocked(vertices, some, blockers.two_sided, origin, frame, directions)
@@ -263,7 +332,7 @@ def test_the_result_is_the_same_every_time_and_at_every_scale():
     # Powers of two scale without rounding.
     for factor in (1.0, 2.0**-10, 2.0**10):
         other = make_blockers("figure", factor * vertices, faces)
-        for name in ("faces", "first_of_cluster", "coarse_of", "first_near", "near", "first_skip", "skip"):
+        for name in set(vars(one)) - {"two_sided"}:
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
@@ -281,13 +350,15 @@ def test_no_faces_hide_nothing():
     assert blockers.faces.shape == (0, 3)
     assert blockers.first_of_cluster.tolist() == [0]
     assert blockers.first_near.tolist() == blockers.first_skip.tolist() == [0] * 6
-    assert len(blockers.near) == len(blockers.skip) == len(blockers.coarse_of) == 0
+    assert len(blockers.near) == len(blockers.skip) == len(blockers.coarse_of) == len(blockers.parent) == 0
+    assert blockers.first_of_level.tolist() == [0, 0, 0]
 
 
 def test_a_single_triangle_stands_for_itself():
     blockers = make_blockers("triangle", np.eye(3), np.array([[0, 1, 2]]))
     assert blockers.faces.tolist() == [[0, 1, 2]] * 2
     assert blockers.near.tolist() == [1, 1, 1] and blockers.skip.tolist() == [0, 0, 0]
+    assert blockers.parent.tolist() == [-1, 0] and blockers.first_of_level.tolist() == [0, 1, 2]
     assert blockers.two_sided
 
 
@@ -308,7 +379,7 @@ def test_degenerate_triangles_do_no_harm(coarse):
     more = [[faces[0, 0], faces[0, 0], faces[0, 1]], [faces[3, 0], count + 3, count + 3], [count, count, count + 1]]
     faces = np.concatenate([faces, more, [[count, count + 1, count + 2], faces[5]]])
     blockers = make_blockers("ball", np.concatenate([vertices, line]), faces, coarse=coarse)
-    np.testing.assert_array_equal(blockers.faces[coarse_count(blockers) :], faces)
+    np.testing.assert_array_equal(blockers.faces[first_fine(blockers) :], faces)
     assert set(blockers.coarse_of.tolist()) == set(range(coarse_count(blockers)))
 
 

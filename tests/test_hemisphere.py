@@ -29,15 +29,18 @@ def far(faces: np.ndarray, vertices: int, two_sided: bool, clusters: int = 1) ->
     nothing = np.zeros(vertices + 1, np.int32)
     first = np.linspace(0, len(faces), clusters + 1).astype(np.int32)
     empty = np.zeros(0, np.int32)
-    return BlockerSet(faces.astype(np.int32), first, empty, nothing, empty, nothing, empty, two_sided)
+    parent, levels = np.full(len(faces), -1, np.int32), np.array([0, len(faces), len(faces)], np.int32)
+    lists = (nothing, empty, nothing, empty)
+    return BlockerSet(faces.astype(np.int32), first, empty, *lists, two_sided, parent, levels)
 
 
 def near(faces: np.ndarray, vertices: int, two_sided: bool) -> BlockerSet:
     """The same, by lists of each vertex."""
     count, empty = len(faces), np.zeros(0, np.int32)
     first = np.arange(vertices + 1, dtype=np.int32) * count
-    lists = np.tile(np.arange(count, dtype=np.int32), vertices)
-    return BlockerSet(faces.astype(np.int32), np.zeros(1, np.int32), empty, first, lists, 0 * first, empty, two_sided)
+    parent, levels = np.full(count, -1, np.int32), np.array([0, 0, count], np.int32)
+    lists = (first, np.tile(np.arange(count, dtype=np.int32), vertices), 0 * first, empty)
+    return BlockerSet(faces.astype(np.int32), np.zeros(1, np.int32), empty, *lists, two_sided, parent, levels)
 
 
 def start(blockers: BlockerSet, points, normals, blocker_vertices, radius: float = 0.0, blocker_of=None):
