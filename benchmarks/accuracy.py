@@ -1,8 +1,8 @@
 """How far a frame is from ray-traced visibility: `python -m benchmarks.accuracy`.
 
-Bowling, falling and statues, cloth and figure, which deform, one frame each, direct light of an environment of order 4, every pixel's centre against
-brute-force ray casting from the same point in the same environment. The reference is scaled to a mean luminance of 0.5
-and both are clamped to [0, 1].
+Bowling, falling and statues, and cloth and figure, which deform: one frame each, direct light of an environment of
+order 4, every pixel's centre against brute-force ray casting from the same point in the same environment. The reference
+is scaled to a mean luminance of 0.5 and both are clamped to [0, 1].
 """
 
 import argparse
