@@ -1,11 +1,11 @@
 """What a frame costs: `python -m benchmarks.frame`.
 
 Milliseconds per frame, for direct light, for bounced light and per stage, nanoseconds per receiver and occluder, and
-the bytes of the baked fields, for bowling, falling, statues and room (and teapots, where `--scenes` names it), at
-640x360 and 1280x720, shaded at pixels and at vertices. The light is that of the studio environment; `--lights` takes
-each scene's own environment and area lights, which closed rooms have in any case. In every measured frame the bodies
-have moved, so that nothing is kept from the frame before. Every configuration runs in a process of its own, so that its
-peak memory is its own.
+the bytes of the baked fields, for bowling, falling, statues and room (and teapots, figure, cloth and chess, where
+`--scenes` names them), at 640x360 and 1280x720, shaded at pixels and at vertices. The light is that of the studio
+environment; `--lights` takes each scene's own environment and area lights, which closed rooms have in any case. In
+every measured frame the bodies have moved, so that nothing is kept from the frame before. Every configuration runs in a
+process of its own, so that its peak memory is its own.
 """
 
 import argparse
@@ -27,6 +27,7 @@ SIZES = ("640x360", "1280x720")
 SHADINGS = ("pixel", "vertex")
 # The frame whose cost is printed, in simulated seconds: the bodies are in motion and close to one another.
 MOMENTS = {"bowling": 1.2, "falling": 1.5, "statues": 1.0, "room": 1.0, "teapots": 1.0}
+MOMENTS |= {"figure": 1.0, "cloth": 1.5, "chess": 1.0}
 # What the Renderer's stages are for; the others (primary visibility, display, ...) belong to neither.
 DIRECT = ("shadow fields", "shadow rays")
 BOUNCES = ("basis irradiances", "light on proxies", "bounces", "last gather")

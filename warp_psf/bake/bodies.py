@@ -91,7 +91,7 @@ def bake_logarithms(scene: Scene, bodies: list[BakedBody], progress: Progress) -
 
 
 def bake_blockers(shape: DeformingShape) -> tuple[BlockerSet, BlockerSet]:
-    """The triangles that hide a deforming body from itself, and those that hide others from the light: of a sheet fewer."""
+    """The triangles that hide a deforming body from itself, and those that hide others: of a sheet fewer."""
     # A body that is not in order at the start has nothing that could be told apart.
     faces = shape.blocker_faces if shape.casts else shape.blocker_faces[:0]
     vertices = shape.blocker_vertices if shape.casts else np.zeros_like(shape.blocker_vertices)
