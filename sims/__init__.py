@@ -126,8 +126,9 @@ def step_frames(
         for _ in range(target - steps):
             mujoco.mj_step(model, data)
         steps = target
-        # A step leaves the poses of bodies and geoms one step behind the joints.
+        # A step leaves the poses of bodies and geoms, and the vertices of flexes, one step behind the joints.
         mujoco.mj_kinematics(model, data)
+        mujoco.mj_flex(model, data)
         mujoco.mj_camlight(model, data)
         yield data
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from sims import HIDDEN_GROUP, add_material, add_mesh, draw_box, draw_mesh, frame_numbers, new_stage
+from sims import HIDDEN_GROUP, add_material, add_mesh, draw_box, draw_mesh, new_stage, step_frames
 from sims.bodies import ball, rounded_box
 
 if TYPE_CHECKING:
@@ -62,17 +62,7 @@ def states(model: mujoco.MjModel, frames_per_second: float = 30, duration: float
     """The state at each frame, from the start: the same `MjData` every time, stepped on."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    steps = 0
-    for frame in frame_numbers(frames_per_second, duration):
-        target = round(frame / frames_per_second / model.opt.timestep)
-        for _ in range(target - steps):
-            mujoco.mj_step(model, data)
-        steps = target
-        # A step leaves the vertices one step behind the joints.
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_flex(model, data)
-        mujoco.mj_camlight(model, data)
-        yield data
+    return step_frames(model, data, frames_per_second, duration)
 
 
 def lights() -> tuple:
