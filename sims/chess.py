@@ -74,6 +74,8 @@ MOVES = (
     Move("black pawn h", "h5", 0.9, 1.6, 0.06),
     Move("white queen", "d6", 1.4, 2.8, 0.19, past=0.15),
 )
+# Of the fields, sRGB.
+DARK_FIELD, LIGHT_FIELD = (0.42, 0.27, 0.18), (0.86, 0.76, 0.58)
 # Seconds in which the light changes.
 DUSK = (1.2, 2.6)
 # Shares of a move: in which a piece rises, and in which it is set down; when it goes, and when it comes back.
@@ -84,8 +86,6 @@ def build() -> mujoco.MjModel:
     """Board, table and fifteen pieces: three are carried, the black king is free, the others stand fast."""
     spec = new_stage(position=(0.75, -2.5, 1.45), target=(0.03, -0.15, 0.03), fovy=32)
     add_material(spec, "table", (0.66, 0.66, 0.62))
-    add_material(spec, "light field", (0.86, 0.76, 0.58), gloss=0.08)
-    add_material(spec, "dark field", (0.42, 0.27, 0.18), gloss=0.08)
     add_material(spec, "frame", (0.3, 0.18, 0.12), gloss=0.08)
     add_material(spec, "white", (0.88, 0.81, 0.68), gloss=0.15)
     add_material(spec, "black", (0.33, 0.21, 0.17), gloss=0.2)
@@ -155,12 +155,13 @@ def place(field: str) -> np.ndarray:
 def _add_board(spec: mujoco.MjSpec) -> None:
     world = spec.worldbody
     draw_box(world, "table", (-12.0, -6.0, -THICKNESS - 0.1), (12.0, 20.0, -THICKNESS), "table")
-    for file in range(8):
-        for rank in range(8):
-            low = (FIELD * (file - 4), FIELD * (rank - 4), -THICKNESS)
-            material = "light field" if (file + rank) % 2 else "dark field"
-            name = "abcdefgh"[file] + str(rank + 1)
-            draw_box(world, name, low, (low[0] + FIELD, low[1] + FIELD, 0.0), material)
+    # Two by two fields, four times along each side of one box: a box for every field would be 64 bodies to shade.
+    checker = {"builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER, "rgb1": LIGHT_FIELD, "rgb2": DARK_FIELD}
+    spec.add_texture(name="fields", type=mujoco.mjtTexture.mjTEXTURE_2D, width=256, height=256, **checker)
+    add_material(spec, "fields", (1.0, 1.0, 1.0), gloss=0.08)
+    fields = spec.material("fields")
+    fields.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB], fields.texrepeat = "fields", [4, 4]
+    draw_box(world, "board", (-EDGE, -EDGE, -THICKNESS), (EDGE, EDGE, 0.0), "fields")
     for name, low, high in (
         ("frame front", (-FRAME, -FRAME), (FRAME, -EDGE)),
         ("frame back", (-FRAME, EDGE), (FRAME, FRAME)),

@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
+import warp_psf as psf
+from benchmarks.accuracy import pixel_points
 from sims import HIDDEN_GROUP, chess, chess_pieces, hand
 from sims.chess_pieces import FIELD
 
@@ -98,14 +100,32 @@ def test_benchmark_set_has_the_papers_size():
     assert vertices[part == 0].max() == pytest.approx(8 * FIELD)
 
 
-def test_board_has_64_fields_of_two_materials(model):
-    fields = [model.geom(file + rank) for file in "abcdefgh" for rank in "12345678"]
-    light = [field.matid[0] == model.material("light field").id for field in fields]
-    assert sum(light) == 32 and not light[0]
-    assert all(field.pos[2] + field.size[2] == pytest.approx(0.0, abs=1e-12) for field in fields)
+def test_board_lies_level_and_only_what_is_hidden_collides(model):
+    board = model.geom("board")
+    np.testing.assert_allclose(board.size[:2], 4 * FIELD)
+    assert board.pos[2] + board.size[2] == pytest.approx(0.0, abs=1e-12)
     for geom in range(model.ngeom):
         collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
         assert bool(collides) == (model.geom_group[geom] == HIDDEN_GROUP)
+
+
+def test_fields_alternate_and_a1_is_dark(model):
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    camera.lookat, camera.distance, camera.elevation, camera.azimuth = (0.0, 0.0, 0.0), 8 * FIELD / 0.36, -90.0, 90.0
+    mujoco.mj_forward(model, data)
+    with psf.Renderer(model, 160, 160, bounces=0) as renderer:
+        renderer.update_scene(data, camera)
+        layers, pose = renderer.layers(), renderer.world_from_camera
+    points = pixel_points(layers["depth"], pose, np.deg2rad(model.vis.global_.fovy))
+    on_board = layers["segmentation"][..., 0] == model.geom("board").id
+    field = np.floor(points[on_board][:, :2] / FIELD).astype(int)
+    # Off the edges of fields, where pixels show two.
+    inside = (np.abs(points[on_board][:, :2] / FIELD - field - 0.5) < 0.35).all(axis=1)
+    light = layers["albedo"][on_board][inside].mean(axis=1) > 0.3
+    # Pixels at the edges of pieces mix the colours of both.
+    assert np.mean(light == (field[inside].sum(axis=1) % 2 == 1)) > 0.98
+    assert len(np.unique(field[inside], axis=0)) > 55  # pieces hide the others
 
 
 def test_every_piece_stands_on_the_board_at_first(model):
