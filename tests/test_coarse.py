@@ -73,6 +73,14 @@ def first_fine(blockers: BlockerSet) -> int:
     return int(blockers.first_of_level[-2])
 
 
+def coarse_of(blockers: BlockerSet) -> np.ndarray:
+    """The coarse triangle that stands for each fine one, [F]."""
+    triangle = np.arange(first_fine(blockers), len(blockers.faces))
+    for _ in range(len(blockers.first_of_level) - 2):
+        triangle = blockers.parent[triangle]
+    return triangle
+
+
 def lists_of(blockers: BlockerSet, vertex: int) -> tuple[np.ndarray, np.ndarray]:
     """The near triangles of a vertex, and the coarse ones that it skips."""
     near = blockers.near[blockers.first_near[vertex] : blockers.first_near[vertex + 1]]
@@ -96,7 +104,7 @@ def boundary(faces):
 
 def test_arrays_are_what_the_contract_says(made):
     name, vertices, faces, blockers = made
-    for array in (blockers.coarse_of, blockers.near, blockers.skip, blockers.first_near, blockers.first_skip):
+    for array in (blockers.near, blockers.skip, blockers.first_near, blockers.first_skip):
         assert array.dtype == np.int32 and array.ndim == 1
     for array in (blockers.faces, blockers.first_of_cluster, blockers.parent, blockers.first_of_level):
         assert array.dtype == np.int32
@@ -110,13 +118,10 @@ def test_every_triangle_has_one_of_the_level_above_that_stands_for_it(made):
     first, parent = blockers.first_of_level, blockers.parent
     assert first[0] == 0 and first[1] == coarse_count(blockers) and first[-1] == len(blockers.faces) == len(parent)
     assert (parent[: first[1]] == -1).all()
-    of_fine = np.arange(first[-2], first[-1])
     for level in range(len(first) - 2, 0, -1):
-        # Each of those above stands for some, and the last steps lead to the coarse ones.
+        # Each of those above stands for some.
         above = np.unique(parent[first[level] : first[level + 1]])
         np.testing.assert_array_equal(above, np.arange(first[level - 1], first[level]))
-        of_fine = parent[of_fine]
-    np.testing.assert_array_equal(of_fine, blockers.coarse_of)
     part = part_of(vertices, faces)
     lower = blockers.faces[first[1] :]
     np.testing.assert_array_equal(part[lower[:, 0]], part[blockers.faces[parent[first[1] :], 0]])
@@ -147,17 +152,17 @@ def test_coarse_triangles_are_sound(made):
 def test_every_fine_triangle_has_one_that_stands_for_it(made):
     name, vertices, faces, blockers = made
     coarse = coarse_faces(blockers)
-    np.testing.assert_array_equal(np.unique(blockers.coarse_of), np.arange(len(coarse)))
+    np.testing.assert_array_equal(np.unique(coarse_of(blockers)), np.arange(len(coarse)))
     part = part_of(vertices, faces)
-    np.testing.assert_array_equal(part[coarse[blockers.coarse_of, 0]], part[faces[:, 0]])
+    np.testing.assert_array_equal(part[coarse[coarse_of(blockers), 0]], part[faces[:, 0]])
     np.testing.assert_array_equal(part[coarse], part[coarse[:, :1]].repeat(3, axis=1))
     # Close by: the middles of triangles lie within the longest edges of what stands for them, but for a few at rims.
     area = 0.5 * np.linalg.norm(area_vectors(vertices, faces), axis=1)
-    size = edge_lengths(vertices, coarse).max(axis=1)[blockers.coarse_of]
-    away = np.linalg.norm(vertices[faces].mean(axis=1) - vertices[coarse].mean(axis=1)[blockers.coarse_of], axis=1)
+    size = edge_lengths(vertices, coarse).max(axis=1)[coarse_of(blockers)]
+    away = np.linalg.norm(vertices[faces].mean(axis=1) - vertices[coarse].mean(axis=1)[coarse_of(blockers)], axis=1)
     assert area[away > size].sum() < 0.01 * area.sum()
     # Looks the same way, as far as it is as narrow as the surface's features are.
-    normal, other = area_vectors(vertices, faces), area_vectors(vertices, coarse)[blockers.coarse_of]
+    normal, other = area_vectors(vertices, faces), area_vectors(vertices, coarse)[coarse_of(blockers)]
     assert area[(normal * other).sum(axis=1) < 0.0].sum() < 0.03 * area.sum()
 
 
@@ -322,7 +327,7 @@ def test_near_and_far_hide_what_the_surface_hides(name, bend, coverage, transfer
 def test_a_surface_with_few_triangles_is_its_own_coarse_surface():
     vertices, faces = ball(cells=4)
     blockers = make_blockers("ball", vertices, faces, coarse=len(faces))
-    np.testing.assert_array_equal(coarse_faces(blockers)[blockers.coarse_of], faces)
+    np.testing.assert_array_equal(coarse_faces(blockers)[coarse_of(blockers)], faces)
     assert measure(vertices, faces, blockers, count=20)[0] == 0.0
 
 
@@ -350,7 +355,7 @@ def test_no_faces_hide_nothing():
     assert blockers.faces.shape == (0, 3)
     assert blockers.first_of_cluster.tolist() == [0]
     assert blockers.first_near.tolist() == blockers.first_skip.tolist() == [0] * 6
-    assert len(blockers.near) == len(blockers.skip) == len(blockers.coarse_of) == len(blockers.parent) == 0
+    assert len(blockers.near) == len(blockers.skip) == len(coarse_of(blockers)) == len(blockers.parent) == 0
     assert blockers.first_of_level.tolist() == [0, 0, 0]
 
 
@@ -380,12 +385,12 @@ def test_degenerate_triangles_do_no_harm(coarse):
     faces = np.concatenate([faces, more, [[count, count + 1, count + 2], faces[5]]])
     blockers = make_blockers("ball", np.concatenate([vertices, line]), faces, coarse=coarse)
     np.testing.assert_array_equal(blockers.faces[first_fine(blockers) :], faces)
-    assert set(blockers.coarse_of.tolist()) == set(range(coarse_count(blockers)))
+    assert set(coarse_of(blockers).tolist()) == set(range(coarse_count(blockers)))
 
 
 def test_all_degenerate_triangles():
     blockers = make_blockers("point", np.zeros((1, 3)), np.zeros((30, 3), int), coarse=10)
-    assert blockers.coarse_of.tolist() == [0] * 30
+    assert coarse_of(blockers).tolist() == [0] * 30
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def far(faces: np.ndarray, vertices: int, two_sided: bool, clusters: int = 1) ->
     empty = np.zeros(0, np.int32)
     parent, levels = np.full(len(faces), -1, np.int32), np.array([0, len(faces), len(faces)], np.int32)
     lists = (nothing, empty, nothing, empty)
-    return BlockerSet(faces.astype(np.int32), first, empty, *lists, two_sided, parent, levels)
+    return BlockerSet(faces.astype(np.int32), first, *lists, two_sided, parent, levels)
 
 
 def near(faces: np.ndarray, vertices: int, two_sided: bool) -> BlockerSet:
@@ -40,7 +40,7 @@ def near(faces: np.ndarray, vertices: int, two_sided: bool) -> BlockerSet:
     first = np.arange(vertices + 1, dtype=np.int32) * count
     parent, levels = np.full(count, -1, np.int32), np.array([0, 0, count], np.int32)
     lists = (first, np.tile(np.arange(count, dtype=np.int32), vertices), 0 * first, empty)
-    return BlockerSet(faces.astype(np.int32), np.zeros(1, np.int32), empty, *lists, two_sided, parent, levels)
+    return BlockerSet(faces.astype(np.int32), np.zeros(1, np.int32), *lists, two_sided, parent, levels)
 
 
 def start(blockers: BlockerSet, points, normals, blocker_vertices, radius: float = 0.0, blocker_of=None):

@@ -59,12 +59,9 @@ def make_blockers(name: str, vertices: np.ndarray, faces: np.ndarray, *, coarse:
     if len(faces) == 0:
         ends, none = np.zeros(len(vertices) + 1, np.int32), np.zeros(0, np.int32)
         triangles, first = np.zeros((0, 3), np.int32), np.zeros(1, np.int32)
-        return BlockerSet(triangles, first, none, ends, none, ends, none, False, none, np.zeros(3, np.int32))
+        return BlockerSet(triangles, first, ends, none, ends, none, False, none, np.zeros(3, np.int32))
     levels, first_of_cluster = _make_levels(vertices, faces, coarse)
     parents = [_stand_for(vertices, finer.faces, level, finer.part) for level, finer in pairwise(levels)]
-    coarse_of = parents[-1]
-    for parent in parents[-2::-1]:
-        coarse_of = parent[coarse_of]
     first_of_level = np.cumsum([0] + [len(level.faces) for level in levels])
     near, skip = _list_triangles(len(vertices), [level.faces for level in levels], parents, first_of_level)
     parent = [np.full(first_of_level[1], -1)]
@@ -72,7 +69,6 @@ def make_blockers(name: str, vertices: np.ndarray, faces: np.ndarray, *, coarse:
     return BlockerSet(
         np.concatenate([level.faces for level in levels]).astype(np.int32),
         first_of_cluster.astype(np.int32),
-        coarse_of.astype(np.int32),
         *(array.astype(np.int32) for array in (*near, *skip)),
         not _is_closed(faces),
         np.concatenate(parent).astype(np.int32),

@@ -18,7 +18,6 @@ class BlockerSet:
     faces: corners among the surface's vertices, int32 [T, 3], level by level: C coarse triangles, cluster by cluster,
         then those of levels in between, and last the F fine ones in the order of the surface.
     first_of_cluster: where each cluster's coarse triangles begin, and where the last one's end, int32 [clusters + 1].
-    coarse_of: the coarse triangle that stands for each fine one, int32 [F].
     first_near, near: of vertex v the triangles near[first_near[v] : first_near[v + 1]], ascending indices into `faces`
         of those below the coarsest level: fine ones next to the vertex, and coarser ones farther away. They stand for
         the same part of the surface as the coarse triangles that touch the vertex's surroundings, once. int32 [V + 1]
@@ -33,7 +32,6 @@ class BlockerSet:
 
     faces: np.ndarray
     first_of_cluster: np.ndarray
-    coarse_of: np.ndarray
     first_near: np.ndarray
     near: np.ndarray
     first_skip: np.ndarray
