@@ -66,6 +66,8 @@ class Renderer:
     bounce_threshold: a body that takes up a smaller share of a point's view than this sends it no bounced light.
     basis_functions: how many functions per body stand for the light that leaves it: 4, 8, 16 or 32.
     order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
+    basis: "sh" shows all light in spherical harmonics; "haar" shows what is small and bright in it, suns, windows and
+        area lights, at full frequency, with sharp-edged shadows.
     compose: how what bodies leave of the light is combined: "product" multiplies their visibilities, "log" adds their
         logarithms and exponentiates the sum. See the README for which is better when.
     shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
@@ -93,6 +95,7 @@ class Renderer:
         environment: str | np.ndarray | Environment | None = "studio",
         lights: Sequence[Light] = (),
         order: int = 4,
+        basis: str = "sh",
         compose: str = "product",
         bounces: int = 3,
         bounce_threshold: float = 0.004,
@@ -106,7 +109,7 @@ class Renderer:
         progress: Progress | None = None,
     ):
         _check_model(model)
-        check_options(height, width, order, compose, shading, exposure, view)
+        check_options(height, width, order, basis, compose, shading, exposure, view)
         if not isinstance(max_geom, Integral) or max_geom < 1:
             raise ValueError(f"max_geom is {max_geom!r}; give a whole number of geoms, at least 1")
         check_bounces(bounces, bounce_threshold, basis_functions)
@@ -115,6 +118,7 @@ class Renderer:
             height=int(height),
             width=int(width),
             order=int(order),
+            basis=basis,
             compose=compose,
             shading=shading,
             bounces=int(bounces),

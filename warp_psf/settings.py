@@ -14,6 +14,7 @@ from warp_psf.film.display import LARGEST_EXPOSURE, VIEWS
 ORDERS = (2, 3, 4, 5, 6)
 SHADINGS = ("pixel", "vertex")
 COMPOSITIONS = ("product", "log")
+BASES = ("sh", "haar")
 # A picture of more pixels than this is a mistyped size: its buffers would take over 30 GB.
 MOST_PIXELS = 2**27
 # After so many bounces between white walls a fiftieth of the light is left.
@@ -30,6 +31,7 @@ class Settings:
     height: int
     width: int
     order: int
+    basis: str
     compose: str
     shading: str
     bounces: int
@@ -50,7 +52,9 @@ def check_bounces(bounces: int, threshold: float, functions: int) -> None:
         raise ValueError(f"basis_functions is {functions}; choose one of {', '.join(map(str, FUNCTION_COUNTS))}")
 
 
-def check_options(height: int, width: int, order: int, compose: str, shading: str, exposure: float, view: str) -> None:
+def check_options(
+    height: int, width: int, order: int, basis: str, compose: str, shading: str, exposure: float, view: str
+) -> None:
     """Raises ValueError for options of the picture that are not usable."""
     for name, size in (("height", height), ("width", width)):
         if not np.isfinite(size) or int(size) != size or size < 1:
@@ -59,6 +63,8 @@ def check_options(height: int, width: int, order: int, compose: str, shading: st
         raise ValueError(f"a picture of {width} x {height} pixels is too large; give at most {MOST_PIXELS} pixels")
     if order not in ORDERS:
         raise ValueError(f"order is {order}; choose one of {', '.join(map(str, ORDERS))}")
+    if basis not in BASES:
+        raise ValueError(f"basis is {basis!r}; choose {' or '.join(map(repr, BASES))}")
     if compose not in COMPOSITIONS:
         raise ValueError(f"compose is {compose!r}; choose {' or '.join(map(repr, COMPOSITIONS))}")
     if shading not in SHADINGS:

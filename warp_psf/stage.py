@@ -11,7 +11,14 @@ import numpy as np
 import warp as wp
 
 from warp_psf.bake import bake_radiance_field
-from warp_psf.bake.bodies import bake_blockers, bake_bodies, bake_light, bake_logarithms, bake_sphere_sets
+from warp_psf.bake.bodies import (
+    bake_blockers,
+    bake_bodies,
+    bake_light,
+    bake_logarithms,
+    bake_outlines,
+    bake_sphere_sets,
+)
 from warp_psf.bake.kept import BakedBody
 from warp_psf.bake.visible_sets import find_visible_sets
 from warp_psf.film.primary import EXTRA_GROUPS, Surfaces, aim, find_surfaces, make_surfaces
@@ -22,6 +29,7 @@ from warp_psf.scene.deforming import Deformed, DeformingShape
 from warp_psf.scene.detail import refine_flat_bodies
 from warp_psf.scene.environment import Environment
 from warp_psf.scene.geometry import DeviceScene, upload_scene, write_deforming, write_loose, write_poses
+from warp_psf.scene.leaves import cut_environment, merge_leaves
 from warp_psf.scene.light import DeltaLight, area_light_entities
 from warp_psf.scene.loose import Loose, LooseRoom
 from warp_psf.scene.scene import Poses, Scene
@@ -37,6 +45,7 @@ from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice
 from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
+from warp_psf.shade.sharp import SharpState, add_sharp_light, add_sharp_moments, upload_sharp, write_leaves
 from warp_psf.shade.spheres import SphereState, carry_spheres, choose_cuts, make_cuts, upload_spheres
 from warp_psf.shade.tint import tint_proxies
 
@@ -72,6 +81,7 @@ class Stage:
     spheres: SphereState
     cuts: Cuts
     lighting: DirectState
+    sharp: SharpState | None
     hemispheres: Hemispheres
     delta_lights: DeltaState
     surfaces: Surfaces
@@ -129,7 +139,14 @@ def set_stage(
     sheets = (hemispheres.sheets, hemispheres.sheet_tables, hemispheres.masks)
     occlusion = upload_occlusion(scene, fields, log_fields, spheres.tables, *sheets, order, 1, device)
     transfers = _transfers(bodies)
-    shining = [(entity, light.radiance) for light, entity in area_lights]
+    sharp = None
+    if settings.basis == "haar":
+        outlines = bake_outlines(scene, bodies, str(device), progress)
+        sharp = upload_sharp(
+            scene, [outlines[entity.mesh] for entity in scene.entities], list(area_lights), order, 1, device
+        )
+    # What is shown at full frequency is not shown twice.
+    shining = [(entity, light.radiance) for light, entity in area_lights if sharp is None]
     lighting = upload_lighting(scene, transfers, shining, order, 1, device)
     size = settings.width, settings.height
     see_through = any(entity.opacity < 1.0 for entity in scene.entities)
@@ -158,6 +175,7 @@ def set_stage(
         spheres=spheres,
         cuts=_make_cuts(spheres, surfaces, vertices, bounces, device),
         lighting=lighting,
+        sharp=sharp,
         hemispheres=hemispheres,
         delta_lights=make_delta_lights(scene, 1, settings.reach, device),
         surfaces=surfaces,
@@ -177,7 +195,11 @@ def set_stage(
 
 def relight(stage: Stage, environments: Sequence[Environment], background: Environment | None) -> None:
     """Puts a stage into other environments; see `set_stage`."""
-    order = stage.settings.order
+    order, device = stage.settings.order, stage.settings.device
+    if stage.sharp is not None:
+        cut = [cut_environment(each) for each in environments]
+        environments = [smooth for smooth, _ in cut]
+        stage.sharp = write_leaves(stage.sharp, merge_leaves([leaves for _, leaves in cut]), 1, device)
     none = np.zeros((order * order, 3))
     write_environment(stage.lighting, sum((each.project(order) for each in environments), none))
     behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
@@ -247,6 +269,10 @@ def draw(stage: Stage) -> None:
         _shade_pixels(stage)
     else:
         _shade_vertices(stage, stage.vertices, stage.vertices_received)
+    if stage.sharp is not None:
+        with _timed(stage, "sharp light"):
+            lights = (stage.occlusion, stage.lighting, stage.sharp)
+            add_sharp_light(surfaces.receivers, scene, *lights, *stage.received, device)
     with _timed(stage, "shadow rays"):
         eye = stage.lighting.table.eye
         add_delta_lights(surfaces.receivers, scene, eye, stage.delta_lights, *stage.received, device)
@@ -295,6 +321,10 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         choose_cuts(cuts, bounces.proxies, stage.spheres, device)
         shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, cuts, *received, device)
         shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, cuts, stage.delta_lights, received[0], device)
+        if stage.sharp is not None:
+            add_sharp_light(bounces.proxies, scene, *lights, stage.sharp, *received, device)
+            gloss = bounces.gloss.table
+            add_sharp_moments(bounces.proxies, gloss.proxy, scene, *lights, stage.sharp, gloss.moment, device)
         eye = stage.lighting.table.eye
         add_delta_lights(bounces.proxies, scene, eye, stage.delta_lights, *bounces.received, device)
     with _timed(stage, "bounces"):

@@ -17,10 +17,12 @@ from warp_psf.bake.kept import BakedBody
 from warp_psf.bake.logarithm import bake_logarithm
 from warp_psf.bake.radiance import BakedRadiance, bake_radiance
 from warp_psf.bake.shape import shape_key, unit_shape
+from warp_psf.bake.silhouettes import bake_silhouettes
 from warp_psf.bake.sphere_set import bake_shape_spheres
 from warp_psf.device import core_count, find_device
 from warp_psf.field.blockers import BlockerSet
 from warp_psf.field.shells import ShadowField
+from warp_psf.field.silhouettes import SilhouetteField
 from warp_psf.field.spheres import SphereSet
 from warp_psf.scene.deforming import DeformingShape
 from warp_psf.scene.detail import refine_radiating
@@ -88,6 +90,19 @@ def bake_logarithms(scene: Scene, bodies: list[BakedBody], progress: Progress) -
         if body.field is not None:
             progress(f"taking logarithms of {mesh.name}", 1.0)
     return logarithms
+
+
+def bake_outlines(
+    scene: Scene, bodies: list[BakedBody], device: str, progress: Progress
+) -> list[SilhouetteField | None]:
+    """The silhouette field of every mesh whose baked body has a field; None for the others."""
+
+    def bake(mesh: Mesh, progress: Progress) -> SilhouetteField:
+        return bake_silhouettes(mesh, device=device, progress=_named(progress, f"baking silhouettes of {mesh.name}"))
+
+    chosen = [index for index, body in enumerate(bodies) if body.field is not None]
+    baked = _bake_shapes(scene, chosen, bake, device, progress)
+    return [baked.get(index) for index in range(len(bodies))]
 
 
 def bake_blockers(shape: DeformingShape) -> tuple[BlockerSet, BlockerSet]:

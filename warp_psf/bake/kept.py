@@ -96,7 +96,7 @@ def load_radiance(
     elif arrays["covered"].shape != (int(arrays["resolutions"][FIRST_OUTER_SHELL]) ** 2,):
         wrong = "covered"
     if wrong:
-        _say_wrong("basis radiance", unit, wrong)
+        say_wrong("basis radiance", unit, wrong)
         return None
     field = BasisRadianceField(
         center=np.zeros(3, np.float32),
@@ -125,13 +125,13 @@ def _load(
     if wrong is None:
         wrong = min(arrays.keys() - layout.keys() - {"codes"}, default=None)
     if wrong is not None:
-        _say_wrong(what, unit, wrong)
+        say_wrong(what, unit, wrong)
         return None
     # Another shape that happens to have the same key is no damage.
     return arrays if is_same_shape(arrays["surface"], unit) else None
 
 
-def _say_wrong(what: str, mesh: Mesh, name: str) -> None:
+def say_wrong(what: str, mesh: Mesh, name: str) -> None:
     message = f"the cached {what} of mesh {mesh.name!r} has a wrong {name!r}; it is baked again"
     warnings.warn(message, stacklevel=5)
 

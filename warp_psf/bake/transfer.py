@@ -31,11 +31,11 @@ def bake_transfer(mesh: Mesh, warp_mesh: wp.Mesh, order: int, device: wp.Device)
     transfer, visibility_of_self = cosine - blocked_cosine, hemisphere - blocked
     _, buried = visibility.leave_solid(warp_mesh, mesh.center, mesh.radius, mesh.closed, points, device)
     both = np.concatenate([transfer, visibility_of_self], axis=1)
-    both = _fill_buried(mesh.faces, buried, both).astype(np.float32)
+    both = fill_buried(mesh.faces, buried, both).astype(np.float32)
     return both[:, : order * order], both[:, order * order :]
 
 
-def _fill_buried(faces: np.ndarray, buried: np.ndarray, values: np.ndarray) -> np.ndarray:
+def fill_buried(faces: np.ndarray, buried: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values [V, K] with those of buried vertices taken from the nearest vertices, along edges, that are not.
 
     A vertex inside another part of the body is seen by nobody, but the faces that reach out of there are: interpolated

@@ -25,14 +25,15 @@ def run_simulation(
     camera: str,
     environment: Any = "studio",
     lights: Sequence = (),
+    basis: str = "sh",
 ) -> None:
     """Reads the command line of `python -m sims.NAME`, simulates and renders: options as `warp-psf render`'s.
 
     build: returns the MjModel.
     states: takes the model and the frames per second, and yields the MjData of frame 0, 1, 2, ...
     name: of the simulation; frames go to out/NAME by default.
-    camera, environment, lights: what the simulation is rendered with, unless the command line says otherwise. Where
-        light changes, `environment` is a function of the time in seconds.
+    camera, environment, lights, basis: what the simulation is rendered with, unless the command line says otherwise.
+        Where light changes, `environment` is a function of the time in seconds.
     """
 
     def simulate(**values: Any) -> None:
@@ -43,7 +44,9 @@ def run_simulation(
             render_frames(build(), states, frames, options, name=name, camera=camera, **lit)
 
     program = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    program.command(name, help=f"Simulates and renders {name}.")(with_options(simulate, out=Path("out", name)))
+    program.command(name, help=f"Simulates and renders {name}.")(
+        with_options(simulate, out=Path("out", name), basis=basis)
+    )
     program()
 
 
@@ -72,7 +75,7 @@ def render_frames(
     chosen_camera = _find_camera(model, options.camera or camera or "-1")
     if options.environment is not None:
         environment = None if options.environment == NO_ENVIRONMENT else options.environment
-    shared = ("order", "compose", "bounces", "shading", "model_lights", "exposure", "view")
+    shared = ("order", "basis", "compose", "bounces", "shading", "model_lights", "exposure", "view")
     same = {option: getattr(options, option) for option in shared}
     # What a frame's pixels depend on. The device is not among it: a run may move to another machine.
     settings = same | dict(motion or {})

@@ -54,6 +54,9 @@ class Options:
     ] = None
     model_lights: Annotated[bool, option(LIGHT, "Use the lights that the model brings.")] = True
     order: Annotated[int, option(LIGHT, "Bands of spherical harmonics.", min=2, max=6)] = 4
+    basis: Annotated[
+        str, option(LIGHT, "sh, or haar, with sharp-edged shadows of suns, windows and area lights.", "sh|haar")
+    ] = "sh"
     compose: Annotated[
         str, option(LIGHT, "How bodies' shadows combine: product, or log, which adds logarithms.", "product|log")
     ] = "product"

@@ -316,7 +316,7 @@ def upload_lighting(
     table.light_entity = wp.array([entity for entity, _ in lights], dtype=wp.int32, device=device)
     radiance = np.array([radiance for _, radiance in lights], np.float32).reshape(1, -1, 3)
     table.light_radiance = wp.array(np.repeat(radiance, worlds, axis=0), dtype=wp.vec3, device=device)
-    facing = [_facing_of(scene.meshes[scene.entities[entity].mesh]) for entity, _ in lights]
+    facing = [facing_of(scene.meshes[scene.entities[entity].mesh]) for entity, _ in lights]
     table.light_facing = wp.array(np.array(facing, np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)
     table.eye = wp.zeros(worlds, dtype=wp.vec3, device=device)
 
@@ -379,7 +379,7 @@ def shade_direct(
     launch(kit.shade_receivers, diffuse.shape, inputs, [diffuse, glossy], device)
 
 
-def _facing_of(mesh: Mesh) -> np.ndarray:
+def facing_of(mesh: Mesh) -> np.ndarray:
     """The side to which a flat open mesh shines; zero for others."""
     if mesh.slab is None or mesh.slab[2].min() > 0:
         return np.zeros(3)

@@ -228,6 +228,7 @@ def make_occlude(order: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(kit),
         matters=matters,
+        nearness=nearness,
         visibility_at=visibility_at,
     )
 

@@ -1,0 +1,271 @@
+"""Which share of small sources bodies leave visible: by their silhouettes, spheres, closed forms or, near by, by rays.
+
+A body that hides all of a group of sources or none of it is asked once; else each source is asked. What several bodies
+leave is multiplied.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from warp_psf.basis import sh, sphere
+from warp_psf.basis.visibility_mask import make_masks
+from warp_psf.field.rasterise import draw_all, make_horizon
+from warp_psf.field.silhouettes import find_silhouette, silhouette_distance
+from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
+from warp_psf.scene.leaves import GROUP
+from warp_psf.shade.coverage import FIELD_SHAPE, SLAB_SHAPE, SPHERE_SHAPE
+from warp_psf.shade.delta import SHADOW_OFFSET, bulb_point
+from warp_psf.shade.fades import Light, horizon_fade
+from warp_psf.shade.occlude import SLAB_HORIZON, make_occlude
+from warp_psf.shade.penumbra import PART_RADIUS, PARTS, disc_share, part_direction, slab_distance, sphere_distance
+from warp_psf.shade.sources import Group, SharpTables, source_of
+
+# Nearer to a body's centre than this many bounding radii its surface may be so near that samples of its field are far
+# apart: edges are then known to this many radians, and where sources are few, rays find them.
+NEAR, NEAR_ERROR = 1.25, 0.1
+FEW_SOURCES = 4
+# Rays to a source; when the first few agree, the rest are left out.
+RAYS, FIRST_RAYS = 16, 4
+shares = wp.types.vector(GROUP, wp.float32)
+
+
+@wp.func
+def ray_share(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, radius: float, size: float) -> float:
+    """The share of a source that a mesh hides; all in the mesh's frame, `size` the radius of its bounding sphere."""
+    disc = sphere.frame_of(direction)
+    wide = wp.tan(wp.min(radius, 1.2))
+    cast = int(0)
+    hidden = int(0)
+    rays = int(wp.static(RAYS))
+    for ray in range(rays):
+        if ray < wp.static(FIRST_RAYS) or (hidden > 0 and hidden < cast):
+            # Steps of 7 through 16 visit every place once, and any four in a row are spread out.
+            place = bulb_point((ray * 7) % wp.static(RAYS), wp.static(RAYS))
+            aimed = direction + wide * (disc * wp.vec3(place[0], place[1], 0.0))
+            cast += 1
+            if wp.mesh_query_ray_anyhit(mesh, origin, wp.normalize(aimed), 4.0 * size):
+                hidden += 1
+    return float(hidden) / float(cast)
+
+
+@cache
+def make_hiding(order: int) -> SimpleNamespace:
+    """The device function `visible_of` over the tables of `order` bands."""
+    kit = make_occlude(order)
+    OcclusionTables = kit.OcclusionTables
+    evaluate, blocked_vector = sh.make_sh(order).evaluate, make_masks(order).blocked_vector
+
+    @wp.func
+    def is_in_way(
+        entity: int, p: wp.vec3, n: wp.vec3, placed: Placed, axis: wp.vec3, spread: float, o: OcclusionTables
+    ) -> bool:
+        """Whether an entity can reach into a cone above a receiver's horizon."""
+        offset = placed.center - p
+        height = wp.dot(n, offset)
+        if height <= -placed.radius:
+            return False
+        squared = wp.length_sq(offset)
+        if squared > placed.radius * placed.radius:
+            distance = wp.sqrt(squared)
+            angle = wp.asin(placed.radius / distance) + spread
+            if angle < wp.pi and wp.dot(axis, offset) < wp.cos(angle) * distance:
+                return False
+        if o[0].occluders.shape[entity] == wp.static(SLAB_SHAPE):
+            half = o[0].occluders.slab_half[entity]
+            n_slab = wp.transpose(placed.rotation * o[0].occluders.slab_rotation[entity]) * n
+            rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
+            middle = wp.dot(n, placed.position + placed.rotation * o[0].occluders.slab_center[entity] - p)
+            return middle + rise > wp.static(SLAB_HORIZON) * placed.radius
+        return True
+
+    @wp.func
+    def hide_by(
+        visible: shares,
+        world: int,
+        entity: int,
+        p: wp.vec3,
+        placed: Placed,
+        n: wp.vec3,
+        weight: float,
+        group: Group,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        s: SharpTables,
+    ) -> shares:
+        """What an entity leaves visible of the sources of a group."""
+        shape = o[0].occluders.shape[entity]
+        offset = placed.center - p
+        to_frame = wp.transpose(placed.rotation)
+        at = to_frame * (p - placed.position)
+        half = wp.vec3()
+        if shape == wp.static(SLAB_SHAPE):
+            to_slab = wp.transpose(placed.rotation * o[0].occluders.slab_rotation[entity])
+            at = to_slab * (p - placed.position - placed.rotation * o[0].occluders.slab_center[entity])
+            to_frame = to_slab
+            half = o[0].occluders.slab_half[entity]
+        seen = find_silhouette(s[0].silhouettes, wp.max(s[0].field[entity], 0), at)
+        # What the distances may be off.
+        error = float(0.0)
+        if shape == wp.static(FIELD_SHAPE) and group.count <= wp.static(FEW_SOURCES):
+            error = wp.where(wp.length(offset) < wp.static(NEAR) * placed.radius, wp.static(NEAR_ERROR), 0.0)
+        result = visible
+        # First the group as a whole, then each source.
+        source = int(-1)
+        while source < group.count:
+            direction = group.axis
+            radius = group.spread
+            if source >= 0:
+                asked = source_of(world, group, source, p, poses, s)
+                direction = asked.direction
+                radius = asked.radius
+            covered = float(0.0)
+            parts = wp.where(source < 0, 1, wp.static(PARTS))
+            if source >= 0 and error > 0.0:
+                parts = 0
+                origin = p + (wp.static(SHADOW_OFFSET) * placed.radius) * n
+                mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
+                origin = wp.transpose(placed.rotation) * (origin - placed.position)
+                covered = float(wp.static(PARTS)) * ray_share(mesh, origin, to_frame * direction, radius, placed.radius)
+            for part in range(parts):
+                toward = direction
+                if source >= 0:
+                    toward = part_direction(direction, radius, part)
+                distance = float(0.0)
+                if shape == wp.static(SPHERE_SHAPE):
+                    distance = sphere_distance(toward, offset, placed.radius)
+                elif shape == wp.static(SLAB_SHAPE):
+                    distance = slab_distance(to_frame * toward, at, half)
+                else:
+                    distance = silhouette_distance(s[0].silhouettes, seen, to_frame * toward)
+                if source < 0:
+                    covered = distance
+                else:
+                    covered += disc_share(distance, wp.static(PART_RADIUS) * radius)
+            if source < 0:
+                if covered <= -radius - error:
+                    return visible
+                if covered >= radius + error:
+                    return (1.0 - weight) * visible
+            else:
+                result[source] = result[source] * (1.0 - weight * covered * wp.static(1.0 / PARTS))
+            source += 1
+        return result
+
+    @wp.func
+    def sphere_set_distance(world: int, root: int, p: wp.vec3, direction: wp.vec3, o: OcclusionTables) -> float:
+        """The angle from a direction to the rim of the union of a sphere set, above zero within it."""
+        largest = float(-wp.pi)
+        for node in range(root, root + 2 * o[0].spheres[0].leaves[root] - 1):
+            if o[0].spheres[0].leaves[node] == 1:
+                offset = o[0].spheres[0].center[world, node] - p
+                largest = wp.max(largest, sphere_distance(direction, offset, o[0].spheres[0].radius[world, node]))
+        return largest
+
+    @wp.func
+    def hide_by_spheres(
+        visible: shares,
+        world: int,
+        root: int,
+        p: wp.vec3,
+        weight: float,
+        group: Group,
+        poses: PoseTables,
+        o: OcclusionTables,
+        s: SharpTables,
+    ) -> shares:
+        """What the spheres of a deforming body leave visible of the sources of a group."""
+        distance = sphere_set_distance(world, root, p, group.axis, o)
+        if distance <= -group.spread:
+            return visible
+        if distance >= group.spread:
+            return (1.0 - weight) * visible
+        result = visible
+        for k in range(group.count):
+            source = source_of(world, group, k, p, poses, s)
+            covered = disc_share(sphere_set_distance(world, root, p, source.direction, o), source.radius)
+            result[k] = result[k] * (1.0 - weight * covered)
+        return result
+
+    @wp.func
+    def hide_by_sheet(
+        visible: shares,
+        world: int,
+        sheet: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        weight: float,
+        group: Group,
+        poses: PoseTables,
+        o: OcclusionTables,
+        s: SharpTables,
+    ) -> shares:
+        """What a deforming sheet leaves visible, as spherical harmonics show it."""
+        hidden = draw_all(world, sheet, make_horizon(p, n), o[0].sheets, o[0].masks)
+        blocked = blocked_vector(hidden, n, o[0].masks)
+        to_entity = wp.transpose(poses[0].rotation[world, o[0].sheet_entity[sheet]])
+        result = visible
+        for k in range(group.count):
+            source = source_of(world, group, k, p, poses, s)
+            covered = wp.clamp(wp.dot(blocked, evaluate(to_entity * source.direction)), 0.0, 1.0)
+            result[k] = result[k] * (1.0 - weight * covered)
+        return result
+
+    @wp.func
+    def visible_of(
+        world: int,
+        own: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        group: Group,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        s: SharpTables,
+    ) -> shares:
+        """Which share of each source of a group is visible past every entity but `own`."""
+        light = Light()
+        light.radius = -1.0
+        if group.light >= 0:
+            placed = find_placed(world, s[0].light_entity[group.light], geometry, poses)
+            light.center = placed.center
+            light.radius = placed.radius
+            light.facing = poses[0].rotation[world, s[0].light_entity[group.light]] * s[0].light_facing[group.light]
+        visible = shares(1.0)
+        for entity in range(geometry[0].entity_mesh.shape[0]):
+            weight = o[0].occluders.opacity[entity]
+            if weight > 0.0 and entity != own:
+                placed = find_placed(world, entity, geometry, poses)
+                if is_in_way(entity, p, n, placed, group.axis, group.spread, o):
+                    if group.light >= 0:
+                        weight *= kit.nearness(entity, p, placed, light, o)
+                    if weight > 0.0:
+                        visible = hide_by(visible, world, entity, p, placed, n, weight, group, geometry, poses, o, s)
+        node = int(0)
+        while node < o[0].spheres[0].leaves.shape[0]:
+            entity = o[0].spheres[0].entity[node]
+            if entity != own and o[0].spheres[0].weight[world, node] > 0.0:
+                placed = find_placed(world, entity, geometry, poses)
+                if is_in_way(entity, p, n, placed, group.axis, group.spread, o):
+                    weight = geometry[0].opacity[entity]
+                    if group.light >= 0:
+                        weight *= kit.nearness(entity, p, placed, light, o)
+                    if weight > 0.0:
+                        visible = hide_by_spheres(visible, world, node, p, weight, group, poses, o, s)
+            node += 2 * o[0].spheres[0].leaves[node] - 1
+        for sheet in range(o[0].sheet_entity.shape[0]):
+            entity = o[0].sheet_entity[sheet]
+            placed = find_placed(world, entity, geometry, poses)
+            # One that is not shown has no radius.
+            if entity != own and placed.radius > 0.0:
+                if is_in_way(entity, p, n, placed, group.axis, group.spread, o):
+                    weight = o[0].sheet_opacity[sheet] * horizon_fade(wp.dot(n, placed.center - p), placed.radius)
+                    if group.light >= 0:
+                        weight *= kit.nearness(entity, p, placed, light, o)
+                    if weight > 0.0:
+                        visible = hide_by_sheet(visible, world, sheet, p, n, weight, group, poses, o, s)
+        return visible
+
+    return SimpleNamespace(visible_of=visible_of)
