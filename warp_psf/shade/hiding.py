@@ -58,9 +58,7 @@ def make_hiding(order: int) -> SimpleNamespace:
     evaluate, blocked_vector = sh.make_sh(order).evaluate, make_masks(order).blocked_vector
 
     @wp.func
-    def is_in_way(
-        entity: int, p: wp.vec3, n: wp.vec3, placed: Placed, axis: wp.vec3, spread: float, o: OcclusionTables
-    ) -> bool:
+    def is_in_way(entity: int, p: wp.vec3, n: wp.vec3, placed: Placed, group: Group, o: OcclusionTables) -> bool:
         """Whether an entity can reach into a cone above a receiver's horizon."""
         offset = placed.center - p
         height = wp.dot(n, offset)
@@ -69,8 +67,10 @@ def make_hiding(order: int) -> SimpleNamespace:
         squared = wp.length_sq(offset)
         if squared > placed.radius * placed.radius:
             distance = wp.sqrt(squared)
-            angle = wp.asin(placed.radius / distance) + spread
-            if angle < wp.pi and wp.dot(axis, offset) < wp.cos(angle) * distance:
+            # The cosine of the sum of both half angles.
+            sine = placed.radius / distance
+            apart = group.cosine * wp.sqrt(1.0 - sine * sine) - group.sine * sine
+            if wp.dot(group.axis, offset) < apart * distance:
                 return False
         if o[0].occluders.shape[entity] == wp.static(SLAB_SHAPE):
             half = o[0].occluders.slab_half[entity]
@@ -238,7 +238,7 @@ def make_hiding(order: int) -> SimpleNamespace:
             weight = o[0].occluders.opacity[entity]
             if weight > 0.0 and entity != own:
                 placed = find_placed(world, entity, geometry, poses)
-                if is_in_way(entity, p, n, placed, group.axis, group.spread, o):
+                if is_in_way(entity, p, n, placed, group, o):
                     if group.light >= 0:
                         weight *= kit.nearness(entity, p, placed, light, o)
                     if weight > 0.0:
@@ -248,7 +248,7 @@ def make_hiding(order: int) -> SimpleNamespace:
             entity = o[0].spheres[0].entity[node]
             if entity != own and o[0].spheres[0].weight[world, node] > 0.0:
                 placed = find_placed(world, entity, geometry, poses)
-                if is_in_way(entity, p, n, placed, group.axis, group.spread, o):
+                if is_in_way(entity, p, n, placed, group, o):
                     weight = geometry[0].opacity[entity]
                     if group.light >= 0:
                         weight *= kit.nearness(entity, p, placed, light, o)
@@ -260,7 +260,7 @@ def make_hiding(order: int) -> SimpleNamespace:
             placed = find_placed(world, entity, geometry, poses)
             # One that is not shown has no radius.
             if entity != own and placed.radius > 0.0:
-                if is_in_way(entity, p, n, placed, group.axis, group.spread, o):
+                if is_in_way(entity, p, n, placed, group, o):
                     weight = o[0].sheet_opacity[sheet] * horizon_fade(wp.dot(n, placed.center - p), placed.radius)
                     if group.light >= 0:
                         weight *= kit.nearness(entity, p, placed, light, o)

@@ -117,6 +117,12 @@ def make_sharp(order: int) -> SimpleNamespace:
             alone = distance <= -group.spread
         visible = visible_of(world, surface.entity, p, n, group, geometry, poses, o, s)
         shines = wp.max(geometry[0].specular[surface.entity]) > 0.0
+        alone = alone or surface.first_transfer < 0
+        if group.light < 0 and alone and not shines and wp.min(visible) == wp.max(visible):
+            if wp.dot(n, group.axis) > group.sine:
+                # All leaves are above the horizon and alike.
+                received.diffuse += visible[0] * (s[0].moment[world, group.number] * n)
+                return received
         exponent = geometry[0].exponent[surface.entity]
         result = received
         # Of a light: what its pieces send to here, and what of that arrives.
@@ -185,7 +191,7 @@ def make_sharp(order: int) -> SimpleNamespace:
         for index in range(s[0].axis.shape[1] + s[0].light_entity.shape[0]):
             group = group_of(world, index, surface.position, geometry, poses, s)
             # Below the horizon as a whole, or the receiver's own body.
-            above = wp.dot(surface.normal, group.axis) > -wp.sin(wp.min(group.spread, 0.5 * wp.pi))
+            above = wp.dot(surface.normal, group.axis) > -group.sine
             if group.light >= 0:
                 entity = s[0].light_entity[group.light]
                 facing = poses[0].rotation[world, entity] * s[0].light_facing[group.light]
@@ -297,6 +303,8 @@ def write_leaves(state: SharpState, leaves: Leaves, worlds: int, device: wp.Devi
     table.direction, table.sent = upload(leaves.direction, wp.vec3), upload(leaves.sent, wp.vec3)
     table.radius = upload(leaves.radius, wp.float32)
     table.first_leaf = wp.array(bounds.astype(np.int32), dtype=wp.int32, device=device)
+    moments = [leaves.sent[a:b].T @ leaves.direction[a:b] for a, b in spans]
+    table.moment = upload(np.array(moments).reshape(-1, 3, 3), wp.mat33)
     table.axis = upload(np.array([axis for axis, _ in cones]).reshape(-1, 3), wp.vec3)
     table.spread = upload(np.array([spread for _, spread in cones]), wp.float32)
     return SharpState(state.order, table, upload_tables([table], SharpTable, device))

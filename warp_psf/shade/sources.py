@@ -20,6 +20,7 @@ class SharpTable:
     first_leaf: wp.array(dtype=wp.int32)  # (group of leaves), and the number of leaves at the end
     axis: wp.array2d(dtype=wp.vec3)  # (world, group of leaves): the middle of the cone that holds it
     spread: wp.array2d(dtype=wp.float32)  # (world, group of leaves): half the cone's angle, radians
+    moment: wp.array2d(dtype=wp.mat33)  # (world, group of leaves): the sum of sent times direction, (channel, axis)
     light_entity: wp.array(dtype=wp.int32)  # (light)
     light_radiance: wp.array2d(dtype=wp.vec3)  # (world, light)
     light_facing: wp.array(dtype=wp.vec3)  # (light): front of a flat one in its frame, else zero
@@ -38,11 +39,14 @@ SharpTables = wp.array(dtype=SharpTable)
 class Group:
     """Sources that are asked together, as a receiver sees them."""
 
+    number: wp.int32  # of a group of leaves
     first: wp.int32
     count: wp.int32
     light: wp.int32  # -1 for leaves
     axis: wp.vec3
     spread: wp.float32  # half the angle of the cone that holds them, radians
+    sine: wp.float32  # of that; of a right angle where it is wider
+    cosine: wp.float32
 
 
 @wp.struct
@@ -60,6 +64,7 @@ def group_of(world: int, index: int, p: wp.vec3, geometry: GeometryTables, poses
     group = Group()
     groups = s[0].axis.shape[1]
     if index < groups:
+        group.number = index
         group.first = s[0].first_leaf[index]
         group.count = s[0].first_leaf[index + 1] - group.first
         group.light = -1
@@ -74,6 +79,8 @@ def group_of(world: int, index: int, p: wp.vec3, geometry: GeometryTables, poses
         distance = wp.max(wp.length(toward), 1.0e-9)
         group.axis = toward / distance
         group.spread = wp.asin(wp.min(placed.radius / distance, 1.0))
+    group.sine = wp.sin(wp.min(group.spread, wp.static(0.5 * np.pi)))
+    group.cosine = wp.cos(wp.min(group.spread, wp.static(0.5 * np.pi)))
     return group
 
 
