@@ -28,11 +28,12 @@ from warp_psf.field.silhouettes import (
     WITHIN,
     SilhouetteField,
     map_frames,
+    spread_at,
 )
 from warp_psf.field.store import load_arrays, save_arrays
 from warp_psf.scene.mesh import Mesh
 
-SILHOUETTES_VERSION = 1
+SILHOUETTES_VERSION = 2
 # Rays per cell and axis: an edge is then known to a quarter of a cell.
 RAYS_PER_CELL = 2
 RAYS = MAP_SIZE * RAYS_PER_CELL
@@ -211,8 +212,7 @@ def _bake(unit: Mesh, device: wp.Device, report: Progress) -> SilhouetteField:
 
 def _sample_shell(unit: Mesh, warp_mesh: wp.Mesh, group: int, shell: int, device: wp.Device) -> np.ndarray:
     """The maps of a shell, float32 [R, C, cells], as many as their interpolation needs."""
-    sine = min(1 / (SHELL_SPACING * (1 + shell)), 1.0)
-    spread = 1.0 if group == WITHIN else math.sqrt(0.5 - 0.5 * math.sqrt(1 - sine**2))
+    spread = 1.0 if group == WITHIN else float(spread_at(np.array(SHELL_SPACING * (1 + shell))))
 
     def cast(rows: int) -> np.ndarray:
         outward = shell_directions(rows, 2 * rows).reshape(-1, 3)

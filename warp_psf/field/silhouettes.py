@@ -5,7 +5,7 @@ direction lies from the body's silhouette: above zero within it, below zero outs
 the direction and with the sample, where visibility jumps: a map of 32 x 32 tells an edge to a fraction of its cell, and
 between two samples an edge moves from one place to the other in place of fading (Wang 2009 keeps visibility so).
 
-A map's axis points to the body's centre, and outside the bounding sphere its radius is that of the sphere's disc. In
+A map's axis points to the body's centre, and outside the bounding sphere its radius is a little more than that of the sphere's disc. In
 these coordinates a body looks much the same from one sample and the next, and from one shell and the next, so that few
 principal components hold all of its maps: a sample is their coefficients, in 8 bits each. A lookup blends the
 coefficients of eight samples, once per receiver, and then asks for the distance in any number of directions.
@@ -22,6 +22,8 @@ from warp_psf.field.shells import FIRST_OUTER_SHELL, SHELL_COUNT, SHELL_SPACING,
 
 # Cells per axis of a map. Finer ones did not bring edges closer to those that rays find.
 MAP_SIZE = 32
+# A map reaches this much further than the bounding sphere's disc, so that edges on the disc's rim have both sides.
+MAP_MARGIN = 1.08
 # The first component is the mean map, whose coefficient is 1.
 COMPONENTS = 64
 # Maps of samples within the bounding sphere are of all directions, those of others of its disc. Both have their own
@@ -167,9 +169,9 @@ def half_sine(cosine: float) -> float:
 
 @wp.func
 def map_spread(ratio: float) -> float:
-    """The sine of half the angle of a sphere's disc; ratio: distance over radius, at least 1."""
+    """The sine of half the angle that is a map's radius; ratio: distance over bounding radius, at least 1."""
     sine = 1.0 / wp.max(ratio, 1.0)
-    return half_sine(wp.sqrt(wp.max(1.0 - sine * sine, 0.0)))
+    return wp.static(MAP_MARGIN) * half_sine(wp.sqrt(wp.max(1.0 - sine * sine, 0.0)))
 
 
 @wp.func
@@ -249,7 +251,8 @@ def silhouette_distance(tables: SilhouetteTables, seen: Silhouette, direction: w
     onto = 1.0 / (wp.sqrt(wp.max(2.0 + 2.0 * local[2], 1.0e-6)) * seen.spread)
     u = local[0] * onto
     v = local[1] * onto
-    beyond = wp.max(wp.sqrt(u * u + v * v) - 1.0, 0.0)
+    # From the angle: straight away from the centre u and v have no digits.
+    beyond = wp.max(half_sine(local[2]) / seen.spread - 1.0, 0.0)
     column = wp.clamp((0.5 * u + 0.5) * float(MAP_SIZE) - 0.5, 0.0, float(MAP_SIZE - 1))
     row = wp.clamp((0.5 * v + 0.5) * float(MAP_SIZE) - 0.5, 0.0, float(MAP_SIZE - 1))
     left = wp.min(int(column), MAP_SIZE - 2)
@@ -260,7 +263,7 @@ def silhouette_distance(tables: SilhouetteTables, seen: Silhouette, direction: w
     texels = wp.vec4i(texel, texel + 1, texel + MAP_SIZE, texel + MAP_SIZE + 1)
     shares = wp.vec4((1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b)
     distance = _sum_modes(seen.coefficients, tables[0].modes, texels, shares)
-    # Beyond the disc nothing is covered, whatever the components' errors say.
+    # Beyond the map nothing is covered, whatever the components' errors say.
     distance = wp.where(beyond > 0.0, wp.min(distance, 0.0) - beyond, distance)
     return 2.0 * seen.spread * distance
 
@@ -360,7 +363,7 @@ def _distances(field: SilhouetteField, points: np.ndarray, directions: np.ndarra
     slot = np.clip(radius.astype(int) - 1, 0, np.where(beyond, SHELL_COUNT - 1, FIRST_OUTER_SHELL - 1))
     place = _inner_places(field)[slot]
     r_0, r_1 = field.shells[place] + 1.0, field.shells[place + 1] + 1.0
-    spread, s_0, s_1 = (_spread(each * SHELL_SPACING) for each in (radius, r_0, r_1))
+    spread, s_0, s_1 = (spread_at(each * SHELL_SPACING) for each in (radius, r_0, r_1))
     weight = np.where(beyond, (s_0 - spread) / np.where(beyond, s_0 - s_1, 1), (radius - r_0) / (r_1 - r_0))
     weight = np.clip(weight, 0, 1)[:, None]
     group = beyond.astype(int)
@@ -378,13 +381,13 @@ def _distances(field: SilhouetteField, points: np.ndarray, directions: np.ndarra
             share = np.abs(1 - row - part[:, 1]) * np.abs(1 - column - part[:, 0])
             modes = field.modes[group, (low[:, 1] + row) * MAP_SIZE + low[:, 0] + column]
             found += share * np.einsum("nk,nk->n", modes, coefficients)
-    outside = np.maximum(np.hypot(*uv.T) - 1, 0)
+    outside = np.maximum(np.sqrt(np.maximum(0.5 - 0.5 * local[:, 2], 0)) / spread - 1, 0)
     return 2 * spread * np.where(outside > 0, np.minimum(found, 0) - outside, found)
 
 
-def _spread(ratio: np.ndarray) -> np.ndarray:
+def spread_at(ratio: np.ndarray) -> np.ndarray:
     """The twin of `map_spread`."""
-    return np.sqrt(0.5 - 0.5 * np.sqrt(1 - 1 / np.maximum(ratio, 1) ** 2))
+    return MAP_MARGIN * np.sqrt(0.5 - 0.5 * np.sqrt(1 - 1 / np.maximum(ratio, 1) ** 2))
 
 
 def _bilinear(field: SilhouetteField, place: np.ndarray, outward: np.ndarray) -> np.ndarray:
