@@ -1,15 +1,15 @@
 # Sets itself up: needs only make and Python 3.11 or newer with its venv module.
 #   make bowling    ten pins and a ball: frames, film and contact sheet in out/bowling
-#                   (likewise falling, statues, room, teapots, figure, cloth, chess)
+#                   (likewise falling, statues, room, teapots, figure, cloth, chess, sunlit)
 #   make test       the tests            make check    ruff and pyright
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: bowling falling statues room teapots figure cloth chess test check clean
+.PHONY: bowling falling statues room teapots figure cloth chess sunlit test check clean
 .DELETE_ON_ERROR:
 
-bowling falling statues room teapots figure cloth chess: .venv/installed
+bowling falling statues room teapots figure cloth chess sunlit: .venv/installed
 	$(BIN)/python -m sims.$@ --out out/$@ $(ARGS)
 
 test: .venv/installed-dev

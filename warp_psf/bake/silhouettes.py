@@ -5,7 +5,6 @@ likewise: one is cast where those around it do not tell what it holds. All maps 
 principal components (see `field/silhouettes.py`).
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +47,8 @@ WELL_INTERPOLATED = 0.9
 # Rows of samples of a shell at least and at most; columns are twice as many.
 COARSEST, FINEST = 8, 32
 GRIDS = (8, 16, 32)
+# Samples, at most, at which interpolation is tried.
+TESTED = 128
 # The shells that have samples. Beyond the bounding sphere a body changes as 1/r.
 SHELLS = {WITHIN: (0, 1, 2, 3, 4), BEYOND: (4, 5, 6, 8, 11, 17, 31)}
 _KEPT = ("rows", "columns", "codes", "minimum", "step", "modes")
@@ -214,21 +215,25 @@ def _sample_shell(unit: Mesh, warp_mesh: wp.Mesh, group: int, shell: int, device
     """The maps of a shell, float32 [R, C, cells], as many as their interpolation needs."""
     spread = 1.0 if group == WITHIN else float(spread_at(np.array(SHELL_SPACING * (1 + shell))))
 
-    def cast(rows: int) -> np.ndarray:
-        outward = shell_directions(rows, 2 * rows).reshape(-1, 3)
+    def cast(rows: int, every: int) -> np.ndarray:
+        outward = shell_directions(rows, 2 * rows).reshape(-1, 3)[::every]
         points = (shell_radii(1.0)[shell] * outward).astype(np.float32)
         if shell <= FIRST_OUTER_SHELL:
             points, _ = visibility.leave_solid(warp_mesh, unit.center, 1.0, unit.closed, points, device)
-        return cast_silhouettes(warp_mesh, points, outward, spread, device).reshape(rows, 2 * rows, -1)
+        return cast_silhouettes(warp_mesh, points, outward, spread, device)
 
-    coarse = cast(COARSEST)
-    while len(coarse) < FINEST:
-        fine = cast(2 * len(coarse))
-        errors = edge_error(double(coarse) - fine, fine)
+    rows = COARSEST
+    while True:
+        coarse = cast(rows, 1).reshape(rows, 2 * rows, -1)
+        if rows == FINEST:
+            return coarse
+        # A part of the finer samples tells whether the others are needed.
+        every = 8 * rows**2 // TESTED + 1
+        fine = cast(2 * rows, every)
+        errors = edge_error(double(coarse).reshape(8 * rows**2, -1)[::every] - fine, fine)
         if np.quantile(errors, WELL_INTERPOLATED) <= EDGE_ERROR:
-            break
-        coarse = fine
-    return coarse
+            return coarse
+        rows *= 2
 
 
 def _cast_own(unit: Mesh, warp_mesh: wp.Mesh, device: wp.Device) -> np.ndarray:

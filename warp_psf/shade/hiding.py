@@ -12,7 +12,7 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.visibility_mask import make_masks
 from warp_psf.field.rasterise import draw_all, make_horizon
-from warp_psf.field.silhouettes import find_silhouette, silhouette_distance
+from warp_psf.field.silhouettes import Silhouette, find_silhouette, silhouette_distance
 from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
 from warp_psf.scene.leaves import GROUP
 from warp_psf.shade.coverage import FIELD_SHAPE, SLAB_SHAPE, SPHERE_SHAPE
@@ -106,7 +106,9 @@ def make_hiding(order: int) -> SimpleNamespace:
             at = to_slab * (p - placed.position - placed.rotation * o[0].occluders.slab_center[entity])
             to_frame = to_slab
             half = o[0].occluders.slab_half[entity]
-        seen = find_silhouette(s[0].silhouettes, wp.max(s[0].field[entity], 0), at)
+        seen = Silhouette()
+        if shape == wp.static(FIELD_SHAPE):
+            seen = find_silhouette(s[0].silhouettes, s[0].field[entity], at)
         # What the distances may be off.
         error = float(0.0)
         if shape == wp.static(FIELD_SHAPE) and group.count <= wp.static(FEW_SOURCES):
