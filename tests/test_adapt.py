@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from warp_psf.bake import adapt
-from warp_psf.bake.adapt import ERROR_THRESHOLD, interpolate_double, reduce_shell, vector_error
+from warp_psf.bake.adapt import (
+    ERROR_THRESHOLD,
+    fit_shell,
+    interpolate_around,
+    interpolate_double,
+    reduce_shell,
+    vector_error,
+)
 from warp_psf.bake.shell import AGREEMENT_INSIDE, fill_shell
 from warp_psf.basis import sh, sphere
 from warp_psf.field.shells import sample_directions
@@ -167,3 +174,36 @@ def test_small_shells_are_cast_whole():
     found, cast = filled(shell)
     assert cast.all()
     np.testing.assert_array_equal(found, shell)
+
+
+def test_fitted_samples_are_fewer_and_as_near():
+    vectors = smooth_shell(1.2, 0.05)
+    everywhere = np.ones(vectors.shape[:2], bool)
+    halved, fitted = (reduce_shell(vectors, 0.01), fit_shell(vectors, 0.01, everywhere))
+    assert len(fitted) < len(halved) < 64
+    finer = fitted
+    while len(finer) < 64:
+        finer = interpolate_around(finer)
+    # The threshold is kept at each halving, to the samples of the one before: three of them add up.
+    assert vector_error(finer - vectors).max() < 0.03
+
+
+def test_what_is_even_needs_the_fewest_samples_and_keeps_its_value():
+    vectors = np.full((64, 64, 16), 0.3, np.float32)
+    fitted = fit_shell(vectors, 0.01, np.ones((64, 64), bool))
+    assert fitted.shape == (8, 8, 16)
+    np.testing.assert_allclose(fitted, 0.3, rtol=1e-6)
+
+
+def test_interpolation_goes_around_the_axis_and_across_the_poles():
+    coarse = np.random.default_rng(4).normal(size=(8, 8, 3))
+    fine = interpolate_around(coarse)
+    assert fine.shape == (16, 16, 3)
+    turned = interpolate_around(np.roll(coarse, 3, axis=1))
+    np.testing.assert_allclose(turned, np.roll(fine, 6, axis=1), rtol=1e-12)
+    # Beyond a pole is the other side: the mirrored shell is interpolated to the mirrored one.
+    np.testing.assert_allclose(interpolate_around(coarse[::-1]), fine[::-1], rtol=1e-12)
+    np.testing.assert_allclose(
+        fine[0, 1],
+        0.75 * (0.75 * coarse[0, 0] + 0.25 * coarse[0, 1]) + 0.25 * (0.75 * coarse[0, 4] + 0.25 * coarse[0, 5]),
+    )

@@ -163,6 +163,7 @@ def test_a_wall_hides_half_of_the_sky_from_a_vertex_beside_it():
     )
     mesh = psf.make_mesh("corner", vertices, faces)
     field = bake_silhouettes(mesh, use_cache=False)
+    assert field.own is not None
     assert field.own.shape == (len(mesh.vertices), 256)
     # A vertex of the floor's top, 0.25 from the wall, which rises 1.1 above it: up to 77 degrees.
     on_top = (mesh.normals[:, 2] > 0.99) & (np.abs(mesh.vertices - (-0.05, 0.0, 0.1)) < 0.06).all(axis=1)

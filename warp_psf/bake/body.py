@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.bake import visibility
-from warp_psf.bake.adapt import ERROR_THRESHOLD, reduce_shell
+from warp_psf.bake.adapt import ERROR_THRESHOLD, fit_shell
 from warp_psf.bake.kept import BakedBody, load_body, save_body
 from warp_psf.bake.shape import shape_key, unit_shape
 from warp_psf.bake.shell import fill_shell
@@ -29,7 +29,7 @@ from warp_psf.field.shells import (
 from warp_psf.scene.mesh import Mesh
 
 # Raised whenever the same settings would give other numbers, so that older files on disk are not used.
-BAKE_VERSION = 4
+BAKE_VERSION = 5
 ORDERS = range(2, 7)
 # Samples that left the solid at points this close, in bounding radii, left it at the same point.
 SAME_POINT = 1.0e-5
@@ -133,7 +133,7 @@ def bake_field(
 
     shells, inside = sample_shells(mesh, warp_mesh, SHELL_COUNT, FINEST_RESOLUTION, project, device, report)
     if threshold is not None:
-        shells = [reduce_shell(vectors, threshold, can_be_read(inside, shell)) for shell, vectors in enumerate(shells)]
+        shells = [fit_shell(vectors, threshold, can_be_read(inside, shell)) for shell, vectors in enumerate(shells)]
     return quantise(mesh.center, mesh.radius, shells)
 
 
