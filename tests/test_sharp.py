@@ -47,12 +47,13 @@ def test_an_open_floor_gets_the_sun_s_cosine():
     np.testing.assert_allclose(irradiance[names == "floor"], TOWARD[2], rtol=2e-3)
 
 
+# A penumbra is two pixels wide here. What a share of the sun is beside a curved edge, in place of a straight one, costs
+# some per cent of it; an edge from a field is up to 0.4 degrees off besides, an eighth of this sun.
 @pytest.mark.parametrize(
-    "shape",
-    ['type="sphere" size=".5"', 'type="box" size=".4 .3 .5"', 'type="capsule" size=".3 .4"'],
-    ids=lambda s: s[6:9],
+    ("shape", "rms"),
+    [('type="sphere" size=".5"', 0.06), ('type="box" size=".4 .3 .5"', 0.06), ('type="capsule" size=".3 .4"', 0.12)],
 )
-def test_shadows_are_those_of_rays(shape):
+def test_shadows_are_those_of_rays(shape, rms):
     body = f'<geom name="body" {shape} pos="0 0 1" material="white" euler="20 30 10"/>'
     irradiance, points, normals, names, renderer, data = picture(FLOOR + body, sun())
     on_floor = names == "floor"
@@ -60,9 +61,7 @@ def test_shadows_are_those_of_rays(shape):
     error = irradiance[on_floor, 0] / TOWARD[2] - visible
     shadow = visible < 1
     assert shadow.sum() > 100
-    # A penumbra is two pixels wide here. What a share of the sun is beside a curved edge, in place of a straight one,
-    # and an edge that is a fifth of a degree off cost some per cent of it.
-    assert np.sqrt((error[shadow] ** 2).mean()) < 0.06
+    assert np.sqrt((error[shadow] ** 2).mean()) < rms
     assert np.abs(error[~shadow]).mean() < 0.004
 
 

@@ -5,10 +5,10 @@ direction lies from the body's silhouette: above zero within it, below zero outs
 the direction and with the sample, where visibility jumps: a map of 32 x 32 tells an edge to a fraction of its cell, and
 between two samples an edge moves from one place to the other in place of fading (Wang 2009 keeps visibility so).
 
-A map's axis points to the body's centre, and outside the bounding sphere its radius is a little more than that of the sphere's disc. In
-these coordinates a body looks much the same from one sample and the next, and from one shell and the next, so that few
-principal components hold all of its maps: a sample is their coefficients, in 8 bits each. A lookup blends the
-coefficients of eight samples, once per receiver, and then asks for the distance in any number of directions.
+A map's axis points to the body's centre, and outside the bounding sphere its radius is a little more than that of the
+sphere's disc. In these coordinates a body looks much the same from one sample and the next, and from one shell and the
+next, so that few principal components hold all of its maps: a sample is their coefficients, in 8 bits each. A lookup
+blends the coefficients of eight samples, once per receiver, and then asks for the distance in any number of directions.
 """
 
 import math
