@@ -59,7 +59,8 @@ def fit_shell(vectors: np.ndarray, threshold: float, matters: np.ndarray) -> np.
     while vectors.shape[0] > COARSEST_RESOLUTION:
         halved = _mean_of_four(vectors)
         for _ in range(FIT_ROUNDS):
-            halved = halved + _mean_of_four(vectors - interpolate_around(halved))
+            missed = np.where(matters[..., None], vectors - interpolate_around(halved), 0)
+            halved = halved + _mean_of_four(missed)
         if np.any(vector_error(interpolate_around(halved) - vectors)[matters] > threshold):
             break
         vectors, matters = halved, _any_of_four(matters)

@@ -6,16 +6,16 @@ the body's bounding sphere are cast, because no other ray can hit.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from warp_psf.basis import haar
 from warp_psf.bake import visibility
 from warp_psf.bake.adapt import ERROR_THRESHOLD, reduce_shell
 from warp_psf.bake.body import SAME_POINT, Progress, can_be_read, cone_of_shell, upload_mesh
+from warp_psf.basis import haar
 from warp_psf.device import core_count, find_device, launch
 from warp_psf.field.shells import (
     FINEST_RESOLUTION,
@@ -27,14 +27,15 @@ from warp_psf.field.shells import (
 from warp_psf.field.wavelets import CELLS, LEVELS, MAP_SIZE, WaveletField, coefficient_levels
 from warp_psf.scene.mesh import Mesh
 
-# The share of the coefficients that is kept: Tamura 2006, section 6.
-KEPT_SHARE = 0.05
-MOST_ENTRIES = round(KEPT_SHARE * CELLS)
+# Entries that a sample has at most, of 4,096 coefficients.
+MOST_ENTRIES = round(haar.KEPT_SHARE * CELLS)
 # Coefficients below this are what rounding leaves of zero: maps go up to 1, and the smallest wavelet of one cell that
 # is covered to a thousandth has 3e-5.
 SMALLEST = 1.0e-6
 # Samples that are transformed at a time: small enough for the cache of a core.
 BLOCK = 64
+# Shells that are coded at a time, next to the one that is cast: each takes 400 MB.
+MOST_CODERS = 4
 
 
 @wp.func
@@ -209,12 +210,20 @@ def bake_wavelet_fields(
     def cast(shell: int, points: np.ndarray, outward: np.ndarray) -> np.ndarray:
         return cast_maps(mesh, warp_mesh, shell, points, outward, on_device, face_radiance)
 
-    shells: list[list[CodedShell]] = []
-    for maps, matters in walk_shells(mesh, warp_mesh, shell_count, resolution, cast, on_device):
-        shells.append(code_shell(maps, thresholds, matters))
-        if progress:
-            progress(len(shells) / shell_count)
-    return [_join(mesh, [shell[which] for shell in reversed(shells)]) for which in range(len(thresholds))]
+    # What nobody can read is stored as the paper has it inside of solids: covered all around, or dark.
+    unread = 1 if face_radiance is None else 0
+    shells: list[Future[list[CodedShell]]] = []
+    with ThreadPoolExecutor(min(core_count(), MOST_CODERS)) as pool:
+        for maps, matters in walk_shells(mesh, warp_mesh, shell_count, resolution, cast, on_device):
+            shells.append(pool.submit(code_shell, maps, thresholds, matters, unread))
+            if len(shells) > MOST_CODERS:
+                shells[-1 - MOST_CODERS].result()
+            if progress:
+                progress(len(shells) / (shell_count + 1))
+        coded = [shell.result() for shell in reversed(shells)]
+    if progress:
+        progress(1.0)
+    return [_join(mesh, [shell[which] for shell in coded]) for which in range(len(thresholds))]
 
 
 def walk_shells(
@@ -267,11 +276,14 @@ class CodedShell:
     step: np.ndarray
 
 
-def code_shell(maps: np.ndarray, thresholds: Sequence[float | None], matters: np.ndarray) -> list[CodedShell]:
+def code_shell(
+    maps: np.ndarray, thresholds: Sequence[float | None], matters: np.ndarray, unread: float
+) -> list[CodedShell]:
     """A shell's samples, thinned out and cut to their largest wavelets, for each threshold.
 
-    maps: [R, R, CELLS]; matters: which samples a receiver can read, bool [R, R]. Vectors are cut after they are
-    thinned out. Before, both mean the same whether maps or vectors are averaged, because the transform is linear.
+    maps: [R, R, CELLS]; matters: which samples a receiver can read, bool [R, R]; unread: what all cells of the others
+    are set to. Equation 1 is that of the whole vectors, and as the transform is linear, maps are averaged in their
+    place. What is left is transformed and cut.
     """
     coded: dict[int, CodedShell] = {}
     sizes = [0] * len(thresholds)
@@ -284,7 +296,7 @@ def code_shell(maps: np.ndarray, thresholds: Sequence[float | None], matters: np
             size, ratio = len(maps), finer // len(maps)
             matters = matters.reshape(size, ratio, size, ratio).any(axis=(1, 3))
         if len(maps) not in coded:
-            coded[len(maps)] = sparsify(maps)
+            coded[len(maps)] = sparsify(np.where(matters[..., None], maps, maps.dtype.type(unread)))
         sizes[which] = len(maps)
     return [coded[size] for size in sizes]
 
@@ -297,37 +309,38 @@ def map_error(difference: np.ndarray) -> np.ndarray:
 def sparsify(maps: np.ndarray) -> CodedShell:
     """Transforms maps [R, R, CELLS] and quantises the largest coefficients of each, in 8 bits."""
     flat = maps.reshape(-1, CELLS)
-    with ThreadPoolExecutor(core_count()) as pool:
-        parts = list(pool.map(lambda k: _largest(flat[k : k + BLOCK]), range(0, len(flat), BLOCK)))
-    sample, index, values = (np.concatenate(column) for column in zip(*parts, strict=True))
-    sample += np.repeat(np.arange(0, len(flat), BLOCK), [len(part[0]) for part in parts])
+    parts = [_find_largest(flat[k : k + BLOCK]) for k in range(0, len(flat), BLOCK)]
+    index, values = (np.concatenate(column) for column in zip(*parts, strict=True))
     level = coefficient_levels()[index]
-    minimum, maximum = np.zeros(LEVELS, np.float32), np.zeros(LEVELS, np.float32)
-    for k in np.unique(level):
-        minimum[k], maximum[k] = values[level == k].min(), values[level == k].max()
-    step = (maximum - minimum) / 255
+    kept = np.abs(values) > SMALLEST
+    minimum, step = np.zeros(LEVELS, np.float32), np.zeros(LEVELS, np.float32)
+    for k in np.unique(level[kept]):
+        of_level = values[kept & (level == k)]
+        minimum[k], step[k] = of_level.min(), np.ptp(of_level) / 255
     # A zero errs no more than the code would.
-    kept = np.abs(values) > 0.5 * step[level]
-    sample, index, values, level = sample[kept], index[kept], values[kept], level[kept]
+    kept &= np.abs(values) > 0.5 * step[level]
     codes = (values - minimum[level]) / np.where(step > 0, step, 1)[level]
-    counts = np.bincount(sample, minlength=len(flat))
     return CodedShell(
-        len(maps), counts, index.astype(np.uint16), np.rint(codes).clip(0, 255).astype(np.uint8), minimum, step
+        resolution=len(maps),
+        counts=np.count_nonzero(kept, axis=1),
+        index=index[kept].astype(np.uint16),
+        codes=np.rint(codes[kept]).clip(0, 255).astype(np.uint8),
+        minimum=minimum,
+        step=step,
     )
 
 
-def _largest(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The largest coefficients of maps [n, CELLS]: of which map, at which place, and what they are, each [entries]."""
+def _find_largest(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The places, rising, and the values of the largest coefficients of maps [n, CELLS], both [n, MOST_ENTRIES]."""
     vectors = haar.transform(maps.reshape(-1, MAP_SIZE, MAP_SIZE).astype(np.float32)).reshape(-1, CELLS)
     sizes = np.abs(vectors)
-    least = np.partition(sizes, CELLS - MOST_ENTRIES, axis=1)[:, CELLS - MOST_ENTRIES, None]
-    chosen = sizes > np.maximum(least, SMALLEST)
-    # Maps of zeros and ones have many coefficients of the same size: of those at the limit as many as there is room for.
-    limit = (sizes == least) & (sizes > SMALLEST)
-    room = MOST_ENTRIES - np.count_nonzero(chosen, axis=1, keepdims=True)
-    chosen |= limit & (np.cumsum(limit, axis=1, dtype=np.int16) <= room)
-    sample, index = np.nonzero(chosen)
-    return sample, index, vectors[chosen]
+    # Maps of zeros and ones have many coefficients of one size. With the place in the last digits no two are alike:
+    # the coarser comes first, and partitioning does not dwell on them.
+    scaled = sizes * ((2**20 - 1) / np.maximum(sizes.max(axis=1, keepdims=True), SMALLEST))
+    keys = scaled.astype(np.uint32) * np.uint32(CELLS) + np.arange(CELLS - 1, -1, -1, dtype=np.uint32)
+    largest = np.partition(keys, CELLS - MOST_ENTRIES, axis=1)[:, CELLS - MOST_ENTRIES :]
+    index = np.sort(CELLS - 1 - largest % CELLS, axis=1).astype(np.int64)
+    return index, np.take_along_axis(vectors, index, axis=1)
 
 
 def _join(mesh: Mesh, shells: list[CodedShell]) -> WaveletField:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_psf.device import upload_tables
+from warp_psf.device import find_device, launch, upload_tables
 from warp_psf.field.shells import FIRST_OUTER_SHELL, SHELL_COUNT, SHELL_SPACING, angles_of
 
 # Cells per axis of a map. Finer ones did not bring edges closer to those that rays find.
@@ -83,6 +83,18 @@ class SilhouetteField:
         `silhouette_distance`.
         """
         return _distances(self, np.asarray(points_body, np.float64), np.asarray(directions, np.float64))
+
+    def hidden_share(self, points_body: np.ndarray, directions: np.ndarray, device: str | None = None) -> np.ndarray:
+        """Which share of unit vectors [D, 3] the body hides from points [N, 3], metres, float32 [N]."""
+        on_device = find_device(device)
+        points, toward = (
+            wp.array(np.asarray(vectors, np.float32), dtype=wp.vec3, device=on_device)
+            for vectors in (points_body, directions)
+        )
+        shares = wp.zeros(len(points_body), dtype=wp.float32, device=on_device)
+        tables = upload_silhouettes([self], on_device)
+        launch(_count_hidden, (1, len(points_body)), [tables, points, toward], [shares], on_device)
+        return shares.numpy()
 
 
 @wp.struct
@@ -292,6 +304,23 @@ def own_distance(tables: SilhouetteTables, vertex: int, normal: wp.vec3, directi
     cell += OWN_SIZE
     lower = (1.0 - a) * float(tables[0].own[vertex, cell]) + a * float(tables[0].own[vertex, cell + 1])
     return wp.static(2.0 * OWN_SPREAD * LARGEST_DISTANCE / 127.0) * ((1.0 - b) * upper + b * lower)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _count_hidden(
+    first: int,
+    tables: SilhouetteTables,
+    points: wp.array(dtype=wp.vec3),  # (point), in the body's frame
+    directions: wp.array(dtype=wp.vec3),  # (direction)
+    share_out: wp.array(dtype=wp.float32),  # (point)
+):
+    world, point = wp.tid()
+    point += first
+    seen = find_silhouette(tables, 0, points[point])
+    hidden = float(0.0)
+    for direction in range(directions.shape[0]):
+        hidden += wp.where(silhouette_distance(tables, seen, directions[direction]) > 0.0, 1.0, 0.0)
+    share_out[point] = hidden / float(directions.shape[0])
 
 
 def map_frames(outward: np.ndarray) -> np.ndarray:

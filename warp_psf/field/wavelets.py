@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.basis import haar
-from warp_psf.device import launch, upload_tables
+from warp_psf.device import find_device, launch, upload_tables
 from warp_psf.field.shells import (
     CONTACT_POWER,
     FIRST_OUTER_SHELL,
@@ -31,7 +31,7 @@ from warp_psf.field.shells import (
 MAP_SIZE = 64
 CELLS = MAP_SIZE * MAP_SIZE
 # The mean, and the details of 1, 2, 4, ... blocks per axis: each has its own range, which is quantised to 8 bits.
-LEVELS = 1 + MAP_SIZE.bit_length() - 1
+LEVELS = MAP_SIZE.bit_length()
 # What a place among 4,096 takes, bytes; how many of them a sample has, at most 205, takes one.
 INDEX_BYTES = 1.5
 COUNT_BYTES = 1
@@ -97,16 +97,16 @@ class WaveletField:
         weight = corners.contact_weight(HEMISPHERE_SHARE * nearer[:, 0, 0])[:, None, None]
         return haar.inverse(corners.scale[:, None, None] * ((1 - weight) * nearer + weight * farther))
 
-    def double_products(
-        self, points_body: np.ndarray, lights: np.ndarray, device: wp.Device, world_count: int = 1
-    ) -> np.ndarray:
-        """What comes from the covered directions of lights, float32 [worlds, N, lights].
+    def double_products(self, points_body: np.ndarray, lights: np.ndarray, device: str | None = None) -> np.ndarray:
+        """What would come from the covered directions of lights, float32 [..., N, lights].
 
-        points_body: receivers in the body's frame, metres, [N, 3], or [worlds, N, 3]. lights: Haar vectors of what
-        comes from each direction in the body's axes, [lights, MAP_SIZE, MAP_SIZE].
+        points_body: receivers in the body's frame, metres, [N, 3] or [worlds, N, 3]. lights: radiance by direction in
+        the body's axes, [lights, MAP_SIZE, MAP_SIZE] (`haar.map_directions`).
         """
-        points = np.broadcast_to(np.asarray(points_body, np.float32), (world_count, *np.shape(points_body)[-2:]))
-        return _double_products(self, points, np.asarray(lights, np.float32), device)
+        points = np.asarray(points_body, np.float32)
+        vectors = haar.transform(np.asarray(lights, np.float64)).reshape(-1, CELLS).astype(np.float32)
+        products = _double_products(self, points.reshape(-1, *points.shape[-2:]), vectors, find_device(device))
+        return products.reshape(*points.shape[:-1], len(vectors))
 
 
 def coefficient_levels() -> np.ndarray:
@@ -184,12 +184,8 @@ def lookup_vector(tables: wp.array(dtype=WaveletTable), p_body: wp.vec3, vector:
     count = tables[0].shell_resolution.shape[0]
     radius = distance / (tables[0].radius * wp.static(SHELL_SPACING))
     inner, weight = between_shells(radius, count)
-    near, near_shares = nearest_four(
-        tables[0].shell_first[inner], tables[0].shell_resolution[inner], theta, phi
-    )
-    far, far_shares = nearest_four(
-        tables[0].shell_first[inner + 1], tables[0].shell_resolution[inner + 1], theta, phi
-    )
+    near, near_shares = nearest_four(tables[0].shell_first[inner], tables[0].shell_resolution[inner], theta, phi)
+    far, far_shares = nearest_four(tables[0].shell_first[inner + 1], tables[0].shell_resolution[inner + 1], theta, phi)
     if inner == wp.static(FIRST_OUTER_SHELL):
         mean = float(0.0)
         for k in range(4):
@@ -226,15 +222,15 @@ def _multiply_lights(
 
 def _double_products(field: WaveletField, points: np.ndarray, lights: np.ndarray, device: wp.Device) -> np.ndarray:
     worlds, receivers = points.shape[:2]
-    on_device = upload_tables([upload_wavelets(field, device)], WaveletTable, device)
-    flat = wp.array(lights.reshape(len(lights), CELLS), dtype=wp.float32, ndim=2, device=device)
+    table = upload_tables([upload_wavelets(field, device)], WaveletTable, device)
+    light_vectors = wp.array(lights, dtype=wp.float32, ndim=2, device=device)
     turn = max(1, min(receivers, TURN // worlds))
     vectors = wp.empty((worlds, turn, CELLS), dtype=wp.float32, device=device)
     products = np.empty((worlds, receivers, len(lights)), np.float32)
     for begin in range(0, receivers, turn):
         part = points[:, begin : begin + turn]
         out = wp.empty((worlds, part.shape[1], len(lights)), dtype=wp.float32, device=device)
-        inputs = [on_device, wp.array(part, dtype=wp.vec3, ndim=2, device=device), flat, vectors]
+        inputs = [table, wp.array(part, dtype=wp.vec3, ndim=2, device=device), light_vectors, vectors]
         launch(_multiply_lights, (worlds, part.shape[1]), inputs, [out], device)
         products[:, begin : begin + turn] = out.numpy()
     return products
