@@ -9,17 +9,25 @@ import mujoco
 import numpy as np
 import pytest
 
-from sims import HIDDEN_GROUP, bodies, bowling, falling, furniture, room, statues, teapots
+from sims import HIDDEN_GROUP, bodies, bowling, falling, furniture, room, statues, sunlit, teapots
 
-SIMULATIONS = {"bowling": bowling, "falling": falling, "statues": statues, "room": room, "teapots": teapots}
-# Drawn bodies and vertices of the scenes of figures 9 to 11 of the paper on adaptive shadow fields, and of figures 6
-# and 7 of the paper on light interreflection; these count the six sides of the room, and the former a rug.
+SIMULATIONS = {
+    "bowling": bowling,
+    "falling": falling,
+    "statues": statues,
+    "room": room,
+    "teapots": teapots,
+    "sunlit": sunlit,
+}
+# Drawn bodies and vertices of the scenes of figures 9 to 11 of the paper on adaptive shadow fields, and of figures 6,
+# 7 and 8 of the paper on light interreflection; two count the six sides of the room, and the former a rug.
 PAPER = {
     "bowling": (15, 41340),
     "falling": (20, 88739),
     "statues": (6, 32875),
     "room": (17, 50000),
     "teapots": (36, 122000),
+    "sunlit": (2, 15082),
 }
 ROOMS = {"room": room, "teapots": teapots}
 # A gridded box has 12 cells along each edge and does not share vertices between its sides.
