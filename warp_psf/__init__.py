@@ -4,7 +4,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warp_psf import area_light
     from warp_psf.bake import BakedBody, bake_mesh
+    from warp_psf.bridge.still import freeze_scene
     from warp_psf.film.display import to_display
     from warp_psf.film.sequence import FrameSequence
     from warp_psf.film.writer import image_difference, read_exr
@@ -21,9 +23,11 @@ __all__ = [
     "FrameSequence",
     "Mesh",
     "Renderer",
+    "area_light",
     "bake_mesh",
     "bake_silhouettes",
     "bake_wavelet_fields",
+    "freeze_scene",
     "image_difference",
     "load_environment",
     "load_mesh",
@@ -46,6 +50,7 @@ _HOMES = {
     "bake_mesh": "bake",
     "bake_silhouettes": "bake.silhouettes",
     "bake_wavelet_fields": "bake.wavelets",
+    "freeze_scene": "bridge.still",
     "image_difference": "film.writer",
     "load_environment": "scene.environment",
     "load_mesh": "scene.mesh",
@@ -56,8 +61,13 @@ _HOMES = {
     "to_display": "film.display",
 }
 
+# Rooms that are public with all they name.
+_ROOMS = ("area_light",)
+
 
 def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        return import_module(f"warp_psf.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'warp_psf' has no attribute {name!r}")
     return getattr(import_module(f"warp_psf.{_HOMES[name]}"), name)

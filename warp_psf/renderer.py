@@ -238,8 +238,7 @@ class Renderer:
         poses = read_poses(self._model, data, stage.scene, view.position)
         self._read_scene(data, option, find_camera(self._model, camera))
         place(stage, poses, view, read_delta_lights(self._model, data, stage.scene, view))
-        self._world_from_camera = np.eye(4)
-        self._world_from_camera[:3, :3], self._world_from_camera[:3, 3] = view.rotation, view.position
+        self._world_from_camera = view.world_from_camera
         self._drawn = False
 
     def learn_motion(self, states: Iterable[mujoco.MjData]) -> None:

@@ -8,11 +8,13 @@ from warp_psf.bridge.loose import read_loose
 from warp_psf.bridge.model import check_data, load_model
 from warp_psf.bridge.shown import looks
 from warp_psf.bridge.sky import read_image_lights, read_skybox
+from warp_psf.bridge.still import freeze_scene
 
 __all__ = [
     "build_scene",
     "check_data",
     "find_camera",
+    "freeze_scene",
     "load_model",
     "looks",
     "meet_deforming",

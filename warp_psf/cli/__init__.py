@@ -11,6 +11,7 @@ from warp_psf.cli.baking import bake
 from warp_psf.cli.comparing import compare
 from warp_psf.cli.frames import run_simulation
 from warp_psf.cli.rendering import render
+from warp_psf.cli.slab import slab
 from warp_psf.cli.versions import info
 
 __all__ = ["app", "main", "run_simulation"]
@@ -23,7 +24,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (render, bake, compare, info):
+for command in (render, slab, bake, compare, info):
     app.command()(command)
 
 

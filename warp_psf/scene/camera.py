@@ -42,6 +42,13 @@ class Camera:
         back = EYE_DISTANCE * self.far if self.orthographic else 0.0
         return self.position + back * self.rotation[:, 2]
 
+    @property
+    def world_from_camera(self) -> np.ndarray:
+        """The pose, float64 [4, 4]."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.rotation, self.position
+        return pose
+
     def half_sizes(self, width: int, height: int) -> tuple[float, float]:
         """Half the width and half the height of the film under a picture of width x height pixels."""
         wide = self.half_height * width / height if self.half_width is None else self.half_width

@@ -1,0 +1,72 @@
+"""A MuJoCo state as a still scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from warp_psf.bridge.cameras import find_camera, read_camera
+from warp_psf.bridge.deforming import meet_deforming, read_deformed
+from warp_psf.bridge.entities import build_scene, read_poses
+from warp_psf.scene.scene import Entity, Scene
+from warp_psf.scene.still import Piece, StillScene, join_pieces
+from warp_psf.scene.texture import decode
+
+
+def freeze_scene(
+    model: mujoco.MjModel,
+    data: mujoco.MjData | None = None,
+    *,
+    cameras: Sequence[int | str | mujoco.MjvCamera] = (-1,),
+    scene_option: mujoco.MjvOption | None = None,
+    material_space: str = "srgb",
+) -> StillScene:
+    """What MuJoCo would draw of a state, as triangles in the world, seen by cameras.
+
+    data: None takes the model's initial state. cameras: ids, names, -1 for the free camera, or `MjvCamera`s.
+    scene_option: what is drawn; MuJoCo's defaults without. Skins and flexes come as they are bent now; sites and
+    tendons, which cast no shadows, are left out.
+
+    Raises:
+        ValueError: there is no such camera, `data` is of another model, or nothing is drawn.
+    """
+    if data is None:
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+    option = mujoco.MjvOption() if scene_option is None else scene_option
+    views = [read_camera(model, data, camera) for camera in cameras]
+    bodies = meet_deforming(model, data, option, material_space) if model.nflex + model.nskin else ()
+    shapes = tuple(body.shape for body in bodies)
+    scene = build_scene(model, option=option, material_space=material_space, model_lights=False, deforming=shapes)
+    poses = read_poses(model, data, scene, views[0].position if views else None)
+    deformed = {}
+    if bodies:
+        view = mujoco.MjvScene(model, 10000)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, option, None, find_camera(model, -1), everything, view)
+        deformed = dict(zip(scene.deforming, read_deformed(model, view, bodies), strict=True))
+    pieces = []
+    for index, entity in enumerate(scene.entities):
+        mesh = scene.meshes[entity.mesh]
+        if index in deformed:
+            body = deformed[index]
+            if body is not None:
+                pieces.append(Piece(body.vertices, body.normals, mesh.faces, _albedo(scene, entity)))
+        elif entity.casts:
+            rotation = poses.rotation[0, index].astype(np.float64)
+            vertices = mesh.vertices @ rotation.T + poses.position[0, index]
+            pieces.append(Piece(vertices, mesh.normals @ rotation.T, mesh.faces, _albedo(scene, entity)))
+    return join_pieces(pieces, views)
+
+
+def _albedo(scene: Scene, entity: Entity) -> np.ndarray:
+    """Linear, per face [F, 3]; a texture counts with its mean."""
+    albedo = []
+    for part in entity.parts:
+        mean = decode(scene.textures[part.texture]).mean(axis=(0, 1, 2)) if part.texture >= 0 else 1.0
+        albedo.append(part.material.albedo * mean)
+    faces = len(scene.meshes[entity.mesh].faces)
+    parts = np.zeros(faces, np.int32) if entity.face_part is None else entity.face_part
+    return np.asarray(albedo, np.float32)[parts]
