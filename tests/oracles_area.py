@@ -48,3 +48,50 @@ def sample_irradiance(
     arriving = np.maximum((offset * normals[:, None]).sum(axis=2), 0.0)
     leaving = np.maximum(-(offset @ facing), 0.0)
     return arriving * leaving * area / squared**2
+
+
+def view_points(
+    scene: StillScene, camera: int, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What rays through pixels' centres meet: mask [height, width]; where it is true, points, normals of the triangles
+    on the viewer's side, and smooth normals [N, 3]."""
+    view = scene.cameras[camera]
+    half_width, half_height = view.half_sizes(width, height)
+    row, column = np.mgrid[:height, :width] + 0.5
+    film = (2 * column / width - 1) * half_width, (1 - 2 * row / height) * half_height, -np.ones((height, width))
+    directions = np.stack(film, axis=-1).reshape(-1, 3) @ view.rotation.T
+    mesh = wp.Mesh(
+        points=wp.array(scene.vertices, dtype=wp.vec3, device="cpu"),
+        indices=wp.array(scene.faces.reshape(-1), dtype=wp.int32, device="cpu"),
+    )
+    found = wp.zeros(len(directions), dtype=wp.vec3, device="cpu")
+    face = wp.zeros(len(directions), dtype=wp.int32, device="cpu")
+    rays = wp.array(directions.astype(np.float32), dtype=wp.vec3, device="cpu")
+    wp.launch(_meet, len(directions), [mesh.id, wp.vec3(*view.position), rays, found, face], device="cpu")
+    there = face.numpy() >= 0
+    share, triangle = found.numpy()[there].astype(np.float64), scene.faces[face.numpy()[there]]
+    weights = np.stack([share[:, 0], share[:, 1], 1 - share[:, 0] - share[:, 1]], axis=1)[..., None]
+    corners = scene.vertices[triangle].astype(np.float64)
+    smooth = (weights * scene.normals[triangle]).sum(axis=1)
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = []
+    for vectors in (flat, smooth):
+        turned = np.where((vectors * directions[there]).sum(axis=1, keepdims=True) > 0, -vectors, vectors)
+        normals.append(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+    return there.reshape(height, width), (weights * corners).sum(axis=1), *normals
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _meet(
+    mesh: wp.uint64,
+    origin: wp.vec3,
+    directions: wp.array(dtype=wp.vec3),
+    share: wp.array(dtype=wp.vec3),
+    face: wp.array(dtype=wp.int32),
+):
+    ray = wp.tid()
+    query = wp.mesh_query_ray(mesh, origin, directions[ray], 1.0e6)
+    face[ray] = -1
+    if query.result:
+        face[ray] = query.face
+        share[ray] = wp.vec3(query.u, query.v, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.oracles import polygon_form_factor
-from tests.oracles_area import sample_irradiance, traced_sight
+from tests.oracles_area import sample_irradiance, traced_sight, view_points
 from warp_psf.area_light.attenuation import SlabView, next_states
 from warp_psf.area_light.quadtree import grow_quadtrees, levels_of
 from warp_psf.area_light.scene_map import bake_scene_map, retrieve_pixels
@@ -57,10 +57,9 @@ def plane() -> LightPlane:
 
 @pytest.fixture(scope="module")
 def seen(scene):
-    """The surface points of the pixels: mask [pixels], points and normals [N, 3]."""
-    pixels = retrieve_pixels(bake_scene_map(scene, 0, WIDTH, HEIGHT), find_device("cpu"))
-    there = pixels.surface.numpy()[0] >= 0
-    return there, pixels.position.numpy()[0][there].astype(np.float64), pixels.normal.numpy()[0][there]
+    """What rays through the pixels meet: mask [pixels], points, normals of triangles and smooth normals [N, 3]."""
+    there, points, flat, smooth = view_points(scene, 0, WIDTH, HEIGHT)
+    return there.ravel(), points, flat, smooth
 
 
 def test_a_cell_that_an_edge_crosses_is_divided_to_the_last():
@@ -119,12 +118,12 @@ def test_a_steep_flat_surface_needs_no_samples_beyond_the_preset():
 
 def test_hard_shadows_agree_with_rays(scene, plane, seen):
     """Each light sample alone. What differs lies on the edges: a texel of the map is 12 mm on the floor."""
-    there, points, normals = seen
+    there, points, flat, normals = seen
     slab = bake_shadow_slab(scene, plane, 513)
     view = SlabView(bake_scene_map(scene, 0, WIDTH, HEIGHT), [slab])
     targets = plane.positions.reshape(-1, 3)
     facing = ((targets[None] - points[:, None]) * normals[:, None]).sum(axis=2) > 0.02
-    sight = traced_sight(scene, points, normals, targets)
+    sight = traced_sight(scene, points, flat, targets)
     wrong = []
     for sample in (0, 7, 12, 24):
         template = np.zeros(25)
@@ -138,8 +137,7 @@ def test_hard_shadows_agree_with_rays(scene, plane, seen):
     assert wrong.mean() < 0.01
 
 
-def test_adaptive_maps_are_as_good_as_full_ones(scene, plane, seen):
-    there, *_ = seen
+def test_adaptive_maps_are_as_good_as_full_ones(scene, plane):
     scene_map = bake_scene_map(scene, 0, WIDTH, HEIGHT)
     images = []
     shares = []
@@ -155,12 +153,12 @@ def test_adaptive_maps_are_as_good_as_full_ones(scene, plane, seen):
 
 
 def test_soft_shadows_agree_with_rays(scene, plane, seen):
-    there, points, normals = seen
+    there, points, flat, normals = seen
     view = SlabView(bake_scene_map(scene, 0, WIDTH, HEIGHT), [bake_shadow_slab(scene, plane, 513)])
     view.set_light(0, np.full((5, 5), 3.0))
     targets = plane.positions.reshape(-1, 3)
     sent = sample_irradiance(points, normals, targets, plane.axes[:, 2], plane.cell_area)
-    lit = (sent * traced_sight(scene, points, normals, targets)).sum(axis=1)
+    lit = (sent * traced_sight(scene, points, flat, targets)).sum(axis=1)
     expected = 3.0 * 0.8 / np.pi * lit
     picture = view.picture()[..., 0].ravel()[there]
     assert np.sqrt(np.mean((picture - expected) ** 2)) < 0.01 * expected.max()
@@ -168,7 +166,7 @@ def test_soft_shadows_agree_with_rays(scene, plane, seen):
 
 def test_unhindered_light_is_that_of_the_rectangle(scene, seen):
     """Sums over 16 x 16 samples come near the polygon's form factor; a sample is 5 cm wide, at 1.5 m or more."""
-    there, points, normals = seen
+    there, points, _, normals = seen
     plane = LightPlane((0.3, 0.2, 2.4), (0.4, 0, 0), (0, -0.4, 0), 16, 16)
     view = SlabView(bake_scene_map(scene, 0, WIDTH, HEIGHT), [bake_shadow_slab(scene, plane, 33)])
     view.set_light(0, np.ones((16, 16)))
@@ -292,3 +290,21 @@ def test_what_cannot_be_used_is_refused(scene, plane):
         view.set_light(0, np.full((5, 5), np.nan))
     with pytest.raises(ValueError, match="no triangles"):
         join_pieces([], [])
+
+
+def test_what_corners_miss_is_met_at_the_sides_of_cells():
+    """A bar 3 pixels wide between the samples of the first level: its end is found, and from there all of it."""
+    pieces = [box((-3, -3, -0.1), (3, 3, 0)), box((-2, 0.5, 0), (2, 0.56, 0.05)), box((1.9, 0.4, 0), (2.3, 0.8, 0.4))]
+    scene = join_pieces(pieces, [camera_at((0, -0.5, 6.0), (0, 0, 0))])
+    pixels = retrieve_pixels(bake_scene_map(scene, 0, 257, 257), find_device("cpu"))
+    there, points, *_ = view_points(scene, 0, 257, 257)
+    found = pixels.position.numpy()[0][there.ravel()]
+    # A pixel whose ray runs along an edge may meet either side of it.
+    assert (np.linalg.norm(found - points, axis=1) > 1e-3).mean() < 1e-4
+
+
+def test_surfaces_end_at_creases():
+    """A box has six flat surfaces; a ball is one that is not flat, though its faces' normals add up to nothing."""
+    scene = join_pieces([box((0, 0, 0), (1, 2, 3)), ball((3, 0, 0), 0.5)], [])
+    assert scene.flat.tolist() == [True] * 6 + [False]
+    assert np.bincount(scene.surface)[:6].tolist() == [2] * 6

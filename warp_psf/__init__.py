@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from warp_psf import area_light
     from warp_psf.bake import BakedBody, bake_mesh
+    from warp_psf.bake.silhouettes import bake_silhouettes
+    from warp_psf.bake.wavelets import bake_wavelet_fields
     from warp_psf.bridge.still import freeze_scene
     from warp_psf.film.display import to_display
     from warp_psf.film.sequence import FrameSequence

@@ -87,11 +87,13 @@ class _Samples:
         self.taken: list[tuple[np.ndarray, ...]] = []
         self.count = 0
 
+    def at(self, cells: np.ndarray, aside: np.ndarray) -> np.ndarray:
+        """Numbers of the samples at places `aside` [K, 2] of cells' first corners, -1 where there is none, [N, K]."""
+        return self.number[self._places(cells, aside[None])]
+
     def at_corners(self, cells: np.ndarray) -> np.ndarray:
         """The samples at cells' corners, taken where there are none yet, int64 [N, 4]."""
-        column = cells[:, None, 1] + cells[:, None, 3] * CORNERS[:, 0]
-        row = cells[:, None, 2] + cells[:, None, 3] * CORNERS[:, 1]
-        place = (cells[:, None, 0] * self.size + row) * self.size + column
+        place = self._places(cells, cells[:, 3, None, None] * CORNERS)
         new = np.unique(place[self.number[place] < 0])
         if len(new):
             self.number[new] = np.arange(self.count, self.count + len(new))
@@ -106,39 +108,82 @@ class _Samples:
         self.taken = [tuple(np.concatenate(arrays) for arrays in zip(*self.taken, strict=True))]
         return self.taken[0]
 
+    def values(self, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
+        """What was sampled at given numbers."""
+        return tuple(array[numbers] for array in self.quantities())
+
+    def _places(self, cells: np.ndarray, aside: np.ndarray) -> np.ndarray:
+        column, row = cells[:, None, 1] + aside[..., 0], cells[:, None, 2] + aside[..., 1]
+        return (cells[:, None, 0] * self.size + row) * self.size + column
+
+
+class _Nodes:
+    """The cells of all maps of a group, and the first child of each."""
+
+    def __init__(self, cells: np.ndarray):
+        self.cells, self.corners, self.child = cells, np.zeros((len(cells), 4), np.int64), np.full(len(cells), -1)
+
+    def divide(self, chosen: np.ndarray) -> np.ndarray:
+        """Gives the nodes of numbers `chosen` four children each, and returns those."""
+        parents = self.cells[chosen]
+        half = parents[:, 3:] // 2
+        children = np.repeat(parents, 4, axis=0)
+        children[:, 1:3] += (half[:, None] * CORNERS).reshape(-1, 2)
+        children[:, 3] //= 2
+        first = len(self.cells)
+        self.child[chosen] = first + 4 * np.arange(len(chosen))
+        self.cells = np.concatenate([self.cells, children])
+        self.corners = np.concatenate([self.corners, np.zeros((len(children), 4), np.int64)])
+        self.child = np.concatenate([self.child, np.full(len(children), -1)])
+        return np.arange(first, len(self.cells))
+
 
 def _grow(maps: np.ndarray, size: int, preset: int, sample: Sample, split: Split) -> Quadtrees:
     side = (size - 1) >> preset
     steps = np.arange(1 << preset) * side
     index, row, column = np.meshgrid(np.arange(len(maps)), steps, steps, indexing="ij")
-    cells = np.stack([array.ravel() for array in (index, column, row, np.full(index.shape, side))], axis=1)
+    nodes = _Nodes(np.stack([array.ravel() for array in (index, column, row, np.full(index.shape, side))], axis=1))
     samples = _Samples(maps, size, sample)
-    links, leaves, nodes_before, leaf_count = [], [], 0, 0
-    while len(cells):
-        corners = samples.at_corners(cells)
-        divided = np.zeros(len(cells), bool)
-        if cells[0, 3] > 1:
-            divided = split(cells, tuple(array[corners] for array in samples.quantities()))
-        link = np.empty(len(cells), np.int64)
-        nodes_after = nodes_before + len(cells)
-        link[divided] = nodes_after + 4 * np.arange(divided.sum())
-        link[~divided] = -1 - (leaf_count + np.arange((~divided).sum()))
-        leaf_count += int((~divided).sum())
-        links.append(link)
-        leaves.append(corners[~divided])
-        half = cells[divided, 3:] // 2
-        children = np.repeat(cells[divided], 4, axis=0)
-        children[:, 1:3] += (half[:, None] * CORNERS).reshape(-1, 2)
-        children[:, 3] //= 2
-        cells, nodes_before = children, nodes_after
+    new = np.arange(len(nodes.cells))
+    while len(new):
+        while len(new):
+            nodes.corners[new] = samples.at_corners(nodes.cells[new])
+            wide = new[nodes.cells[new, 3] > 1]
+            chosen = wide[split(nodes.cells[wide], samples.values(nodes.corners[wide]))] if len(wide) else wide
+            new = nodes.divide(chosen)
+        # What is narrower than a cell and missed by its corners may be met at its sides, by finer neighbours.
+        new = nodes.divide(_find_met_aside(nodes, samples, split))
+    leaf = nodes.child < 0
+    link = np.where(leaf, -np.cumsum(leaf), nodes.child).astype(np.int32)
     order, first_sample, number = _by_map(np.concatenate(samples.place), size, len(maps))
     quantities = tuple(array[order] for array in samples.quantities())
-    # Nodes of a level lie behind one another across maps: only the first level is found by its map.
+    # Below the first level, the nodes of all maps lie behind one another.
     first_node = np.arange(len(maps) + 1, dtype=np.int64) << (2 * preset)
-    corners = number[np.concatenate(leaves)].astype(np.int32)
-    return Quadtrees(
-        size, preset, first_node, np.concatenate(links).astype(np.int32), corners, first_sample, quantities
-    )
+    corners = number[nodes.corners[leaf]].astype(np.int32)
+    return Quadtrees(size, preset, first_node, link, corners, first_sample, quantities)
+
+
+def _find_met_aside(nodes: _Nodes, samples: _Samples, split: Split) -> np.ndarray:
+    """The numbers of leaves that would be divided if a sample on one of their sides were their last corner."""
+    found = []
+    leaves = np.flatnonzero((nodes.child < 0) & (nodes.cells[:, 3] > 1))
+    for side in np.unique(nodes.cells[leaves, 3]):
+        chosen = leaves[nodes.cells[leaves, 3] == side]
+        along = np.arange(1, side)
+        aside = np.concatenate([np.stack(np.broadcast_arrays(*each), axis=1) for each in _sides(along, side)])
+        at = samples.at(nodes.cells[chosen], aside)
+        which, place = np.nonzero(at >= 0)
+        if len(which):
+            corners = nodes.corners[chosen[which]].copy()
+            corners[:, 3] = at[which, place]
+            divided = split(nodes.cells[chosen[which]], samples.values(corners))
+            found.append(np.unique(chosen[which[divided]]))
+    return np.concatenate(found) if found else leaves[:0]
+
+
+def _sides(along: np.ndarray, side: int) -> list[tuple]:
+    """(column, row) of samples along the four sides of a cell."""
+    return [(along, 0), (along, side), (0, along), (side, along)]
 
 
 def _by_map(place: np.ndarray, size: int, maps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -104,7 +104,7 @@ def _find_surfaces(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-30)
     length = np.linalg.norm(vectors, axis=1)
     aside = np.linalg.norm(np.cross(vectors, mean[surface]), axis=1)
-    bent = (aside > FLAT_ANGLE * length) | ((vectors * mean[surface]).sum(axis=1) < 0.0)
+    bent = (aside > FLAT_ANGLE * length) | ((vectors * mean[surface]).sum(axis=1) <= 0.0)
     return surface, np.bincount(surface, bent, len(first)) == 0
 
 
