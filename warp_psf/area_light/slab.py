@@ -289,6 +289,8 @@ def visible_share(slab: SlabTable, sample: int, p: wp.vec3, n: wp.vec3, surface:
     share = float(0.0)
     for k in range(4):
         here = inverse + (float(k % 2) - u) * along_u + (float(k / 2) - v) * along_v
+        # A steep surface spans a range of depths within a sample; what lies in it beside the surface does not hide it.
+        here = wp.max(here, inverse + wp.abs(along_u) + wp.abs(along_v))
         margin = wp.where(met[k] == surface, OWN_BIAS, BIAS)
         if depths[k] <= here * (1.0 + margin) or (met[k] == surface and flat):
             share += weights[k]
