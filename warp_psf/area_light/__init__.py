@@ -2,12 +2,17 @@
 
 from warp_psf.area_light import templates
 from warp_psf.area_light.attenuation import SlabView
+from warp_psf.area_light.points import PointLists, sample_points
 from warp_psf.area_light.scene_map import SceneMap, bake_scene_map
 from warp_psf.area_light.script import Script, play_script, read_script
 from warp_psf.area_light.slab import LightPlane, ShadowSlab, bake_shadow_slab, make_light_plane
+from warp_psf.area_light.splatting import DevicePoints, PointPicture, splat_points, upload_points
 
 __all__ = [
+    "DevicePoints",
     "LightPlane",
+    "PointLists",
+    "PointPicture",
     "SceneMap",
     "Script",
     "ShadowSlab",
@@ -17,5 +22,8 @@ __all__ = [
     "make_light_plane",
     "play_script",
     "read_script",
+    "sample_points",
+    "splat_points",
     "templates",
+    "upload_points",
 ]
