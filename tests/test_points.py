@@ -127,7 +127,7 @@ def test_depth_is_that_of_the_mesh(scene):
     depth = -((points - camera.position) @ camera.rotation)[:, 2]
     inner = shifted(there).all(axis=0)[there]
     error = np.abs(picture.depth[there] - depth)[inner]
-    # On the ball a neighbour's square, 4 mm wide, lies over the next facet by its tilt, a tenth, where it reaches there.
+    # On the ball a neighbour's square, 4 mm wide, lies over the next facet by its tilt, a tenth, where it reaches it.
     assert np.median(error) < 4e-4
     # At a silhouette within the body the nearer part reaches over by a pixel: 1 % of the pixels, or a few.
     assert (error > 0.02).mean() < 0.03

@@ -1,0 +1,266 @@
+"""The layered area light map: how much of a light each surface point receives, for any viewpoint (Jeng 2005, 4.2).
+
+Reference views from points on and near the light find surface points. Seen from the light's middle each lies in a cell
+of the map; a cell keeps one point for each surface that it meets, with the share of the light that reaches it. The map
+of a flat light is a square before it, that of any other shape a cube about it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_psf.area_light.light_samples import LightSamples, LightTable, sample_light, upload_light, visible_ratio
+from warp_psf.area_light.tracing import StillTable, meet, smooth_normal, upload_still
+from warp_psf.device import find_device, launch
+from warp_psf.scene.light import AreaLight
+from warp_psf.scene.still import StillScene
+
+# A flat light's map looks no further aside than this, as a tangent: 76 degrees. What is beyond is lit by less than a
+# 17th; and a fitted square is this much wider than what it covers.
+WIDEST, MARGIN = 4.0, 1.02
+# How far out on a light's diagonals, in half diagonals, reference points stand: at its corners, and outside it.
+CORNERS, OUTSIDE = 1.0, 1.5
+FARTHEST = wp.constant(1.0e6)
+LARGEST_SIZE, MOST_SAMPLES = 4096, 4096
+
+
+@wp.struct
+class FrameTable:
+    """The square faces of a map: which direction each looks in, and how far it reaches."""
+
+    origin: wp.vec3  # the base point, world, metres
+    rotation: wp.array(dtype=wp.mat33)  # (face): world_from_face; it looks along its third axis
+    window: wp.array(dtype=wp.vec2)  # (face): middle of its square, tangents
+    half: wp.float32  # of its side, as a tangent
+    size: wp.int32  # cells along it
+
+
+@dataclass(frozen=True, eq=False)
+class LayeredMap:
+    """A layered area light map. Built by `bake_layered_map`.
+
+    light: points on the light that shadows were asked of.
+    radiance: of the light, float64 [3].
+    origin: the base point, metres. rotation: world_from_face, float64 [faces, 3, 3]. window, half: middles of the
+        faces' squares [faces, 2] and half their side, tangents. size: cells along it.
+    first: where each cell's elements begin, int32 [cells + 1]; a face's cells lie by rows.
+    surface: of each element, int32 [E]. visibility: share of the light that arrives, float32 [E].
+    position, normal: world, float32 [E, 3].
+    """
+
+    light: LightSamples
+    radiance: np.ndarray
+    origin: np.ndarray
+    rotation: np.ndarray
+    window: np.ndarray
+    half: float
+    size: int
+    first: np.ndarray
+    surface: np.ndarray
+    visibility: np.ndarray
+    position: np.ndarray
+    normal: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        """What cells and elements take, bytes."""
+        arrays = (self.first, self.surface, self.visibility, self.position, self.normal)
+        return sum(array.nbytes for array in arrays)
+
+
+def bake_layered_map(
+    scene: StillScene, light: AreaLight, size: int = 512, *, samples: int = 144, device: str | None = None
+) -> LayeredMap:
+    """Finds surface points from nine reference views, and how much of the light each receives.
+
+    size: cells along a side of the map, and pixels of a reference view. samples: points on the light.
+
+    The reference points stand at the light's middle, at the corners of its bounding rectangle, and outside it on the
+    diagonals. Source: Jeng 2005, sections 4.2.3 and 4.4.
+
+    Raises:
+        ValueError: a number is not usable, the light hangs on a body, or nothing of the scene is before it.
+    """
+    if not isinstance(size, (int, np.integer)) or not 2 <= size <= LARGEST_SIZE:
+        raise ValueError(f"size is {size!r}; give a whole number of cells from 2 to {LARGEST_SIZE}")
+    if not isinstance(samples, (int, np.integer)) or not 1 <= samples <= MOST_SAMPLES:
+        raise ValueError(f"samples is {samples!r}; give a whole number of points from 1 to {MOST_SAMPLES}")
+    on_device = find_device(device)
+    still = upload_still(scene, on_device)
+    points = sample_light(light, samples)
+    base, references = _reference_points(light)
+    rotation, window, half = _faces(scene, light, base)
+    frame = make_frame(base, rotation, window, half, int(size), on_device)
+    elements = _Elements(len(scene.flat))
+    for reference in references:
+        elements.add(*_look_from(still.table, frame, reference, on_device))
+    cell, kept = elements.sorted()
+    visibility = _ask(still.table, upload_light(points, on_device), kept, on_device)
+    first = np.searchsorted(cell, np.arange(len(rotation) * size**2 + 1)).astype(np.int32)
+    return LayeredMap(
+        points,
+        np.asarray(light.radiance, np.float64),
+        base,
+        rotation,
+        window,
+        half,
+        int(size),
+        first,
+        kept["surface"],
+        visibility,
+        kept["position"],
+        kept["normal"],
+    )
+
+
+def _reference_points(light: AreaLight) -> tuple[np.ndarray, np.ndarray]:
+    """The base point and all reference points, world [9, 3]: it, and four corners twice."""
+    vertices = light.mesh.vertices.astype(np.float64)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    # The light's rectangle spans its own x and y; of a body with depth, the corners lie at half its depth.
+    signs = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)])
+    offsets = np.concatenate([[[0.0, 0.0, 0.0]], CORNERS * signs * half, OUTSIDE * signs * half])
+    world = light.position + (middle + offsets) @ light.rotation.T
+    return world[0], world
+
+
+def _faces(scene: StillScene, light: AreaLight, base: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotations, middles and half a side of the map's squares: one before a flat light, or a cube's six."""
+    slab = light.mesh.slab
+    if slab is None or slab[2][2] > 0.0:
+        x, y, z = np.eye(3)
+        axes = [(y, z, x), (z, x, y), (x, y, z), (-y, z, -x), (-z, x, -y), (-x, y, -z)]
+        return np.stack([np.stack(each, axis=1) for each in axes]), np.zeros((6, 2)), 1.0
+    rotation = light.rotation @ slab[1]
+    local = (scene.vertices - base) @ rotation
+    local = local[local[:, 2] > 0.0]
+    if not len(local):
+        raise ValueError(f"nothing of the scene is before light {light.name!r}; turn it")
+    tangent = np.clip(local[:, :2] / local[:, 2:], -WIDEST, WIDEST)
+    low, high = tangent.min(axis=0), tangent.max(axis=0)
+    return rotation[None], 0.5 * (low + high)[None], MARGIN * 0.5 * float((high - low).max())
+
+
+def make_frame(
+    origin: np.ndarray, rotation: np.ndarray, window: np.ndarray, half: float, size: int, device: wp.Device
+) -> FrameTable:
+    """Puts a map's squares on the device."""
+    frame = FrameTable()
+    frame.origin = wp.vec3(*map(float, origin))
+    frame.rotation = wp.array(rotation.astype(np.float32), dtype=wp.mat33, device=device)
+    frame.window = wp.array(window.astype(np.float32), dtype=wp.vec2, device=device)
+    frame.half, frame.size = half, size
+    return frame
+
+
+@wp.func
+def cell_of(frame: FrameTable, p: wp.vec3) -> int:
+    """The cell of the map in which the base point sees p, -1 where no face looks."""
+    found = int(-1)
+    for face in range(frame.rotation.shape[0]):
+        local = wp.transpose(frame.rotation[face]) * (p - frame.origin)
+        if local[2] > 0.0 and found < 0:
+            window = frame.window[face]
+            u = 0.5 + 0.5 * (local[0] / local[2] - window[0]) / frame.half
+            v = 0.5 - 0.5 * (local[1] / local[2] - window[1]) / frame.half
+            # Two faces of a cube share their rim, which rounding must not lose.
+            if wp.min(u, v) > -1.0e-5 and wp.max(u, v) < 1.0 + 1.0e-5:
+                column = wp.clamp(int(u * float(frame.size)), 0, frame.size - 1)
+                row = wp.clamp(int(v * float(frame.size)), 0, frame.size - 1)
+                found = (face * frame.size + row) * frame.size + column
+    return found
+
+
+class _Elements:
+    """The points so far, one for each surface in a cell: that of the view which came first."""
+
+    def __init__(self, surfaces: int):
+        self.surfaces = surfaces
+        self.keys = np.zeros(0, np.int64)
+        self.kept: list[dict[str, np.ndarray]] = []
+
+    def add(self, cell: np.ndarray, found: dict[str, np.ndarray]) -> None:
+        """Adds the points of a view whose cell and surface have none yet."""
+        keys, first = np.unique(cell * self.surfaces + found["surface"], return_index=True)
+        new = ~np.isin(keys, self.keys, assume_unique=True)
+        self.keys = np.concatenate([self.keys, keys[new]])
+        self.kept.append({name: values[first[new]] for name, values in found.items()})
+
+    def sorted(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """All points by their cells, and those [E]."""
+        order = np.argsort(self.keys, kind="stable")
+        merged = {name: np.concatenate([each[name] for each in self.kept])[order] for name in self.kept[0]}
+        return self.keys[order] // self.surfaces, merged
+
+
+def _look_from(
+    still: StillTable, frame: FrameTable, reference: np.ndarray, device: wp.Device
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """What a reference view sees: cells, and the points' surface, position, normal and that of their triangle."""
+    rays = frame.rotation.shape[0] * frame.size**2
+    cell, surface = (wp.zeros((1, rays), dtype=wp.int32, device=device) for _ in range(2))
+    vectors = [wp.zeros((1, rays), dtype=wp.vec3, device=device) for _ in range(3)]
+    inputs = [still, frame, wp.vec3(*map(float, reference))]
+    launch(_find_points, (1, rays), inputs, [cell, surface, *vectors], device)
+    there = cell.numpy()[0] >= 0
+    names = ("position", "normal", "facing")
+    found = {name: array.numpy()[0][there] for name, array in zip(names, vectors, strict=True)}
+    return cell.numpy()[0][there].astype(np.int64), found | {"surface": surface.numpy()[0][there]}
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _find_points(
+    first: int,
+    still: StillTable,
+    frame: FrameTable,
+    reference: wp.vec3,
+    cell_out: wp.array2d(dtype=wp.int32),  # (world, ray), -1: nothing that the map covers
+    surface_out: wp.array2d(dtype=wp.int32),  # (world, ray)
+    position_out: wp.array2d(dtype=wp.vec3),  # (world, ray)
+    normal_out: wp.array2d(dtype=wp.vec3),  # (world, ray)
+    facing_out: wp.array2d(dtype=wp.vec3),  # (world, ray): of the triangle
+):
+    world, ray = wp.tid()
+    ray += first
+    face = ray / (frame.size * frame.size)
+    place = ray % (frame.size * frame.size)
+    window = frame.window[face]
+    x = window[0] + frame.half * (2.0 * (float(place % frame.size) + 0.5) / float(frame.size) - 1.0)
+    y = window[1] + frame.half * (1.0 - 2.0 * (float(place / frame.size) + 0.5) / float(frame.size))
+    hit = meet(still, reference, frame.rotation[face] * wp.vec3(x, y, 1.0), FARTHEST)
+    cell_out[world, ray] = -1
+    if hit.face >= 0:
+        cell_out[world, ray] = cell_of(frame, hit.position)
+        surface_out[world, ray] = hit.surface
+        position_out[world, ray] = hit.position
+        normal_out[world, ray] = smooth_normal(still, hit)
+        facing_out[world, ray] = hit.normal
+
+
+def _ask(still: StillTable, light: LightTable, kept: dict[str, np.ndarray], device: wp.Device) -> np.ndarray:
+    """The share of the light that reaches each point, float32 [E]."""
+    count = len(kept["position"])
+    visibility = wp.zeros((1, count), dtype=wp.float32, device=device)
+    arrays = [wp.array(kept[name][None], dtype=wp.vec3, device=device) for name in ("position", "facing", "normal")]
+    launch(_ask_points, (1, count), [still, light, *arrays], [visibility], device)
+    return visibility.numpy()[0]
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _ask_points(
+    first: int,
+    still: StillTable,
+    light: LightTable,
+    position: wp.array2d(dtype=wp.vec3),  # (world, point)
+    facing: wp.array2d(dtype=wp.vec3),  # (world, point)
+    normal: wp.array2d(dtype=wp.vec3),  # (world, point)
+    visibility_out: wp.array2d(dtype=wp.float32),  # (world, point)
+):
+    world, point = wp.tid()
+    point += first
+    p = position[world, point]
+    visibility_out[world, point] = visible_ratio(
+        still, light, world, p, facing[world, point], normal[world, point], False
+    )
