@@ -1,6 +1,7 @@
-"""Simulations to render: bowling, falling, statues, room, teapots, figure, cloth and chess.
+"""Simulations to render: bowling, falling, statues, room, teapots, figure, cloth, chess and sunlit.
 
-`python -m sims.bowling` renders one.
+`python -m sims.bowling` renders one. Pipe, cubes, office, spiralling_boxes, garden, bunny and pisa are scenes at rest,
+for the methods of `warp_psf.area_light`.
 
 Each of these modules has `build() -> MjModel`, `states(model, frames_per_second, duration) -> Iterator[MjData]`,
 `lights()` and `environment()`. What they share is here. In every model, drawn geoms neither collide nor weigh, and the
@@ -39,14 +40,25 @@ def new_stage(position: tuple[float, float, float], target: tuple[float, float, 
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     # Lit by environment and area lights: a lamp at the camera would flatten the shapes.
     spec.visual.headlight.active = 0
+    add_camera(spec, "front", position, target, fovy)
+    return spec
+
+
+def add_camera(
+    spec: mujoco.MjSpec,
+    name: str,
+    position: tuple[float, float, float],
+    target: tuple[float, float, float],
+    fovy: float,
+) -> None:
+    """A camera at `position` (metres) that looks at `target`, its horizon level; fovy in degrees."""
     back = np.subtract(position, target)
     right = np.cross([0.0, 0.0, 1.0], back)
     up = np.cross(back, right)
     rotation = np.stack([axis / np.linalg.norm(axis) for axis in (right, up, back)], axis=1)
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    spec.worldbody.add_camera(name="front", pos=position, quat=quaternion, fovy=fovy)
-    return spec
+    spec.worldbody.add_camera(name=name, pos=position, quat=quaternion, fovy=fovy)
 
 
 def add_material(spec: mujoco.MjSpec, name: str, rgb: tuple[float, float, float], gloss: float = 0.0) -> None:
@@ -131,6 +143,11 @@ def step_frames(
         mujoco.mj_flex(model, data)
         mujoco.mj_camlight(model, data)
         yield data
+
+
+def rest(model: mujoco.MjModel, frames_per_second: float = 30, duration: float = math.inf) -> Iterator[mujoco.MjData]:
+    """The states of a scene in which nothing moves: the same `MjData` every time."""
+    return step_frames(model, mujoco.MjData(model), frames_per_second, duration)
 
 
 def frame_numbers(frames_per_second: float, duration: float) -> Iterator[int]:

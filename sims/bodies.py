@@ -285,12 +285,22 @@ def _figure_distance(points: np.ndarray, limbs: tuple) -> np.ndarray:
     axial = np.abs(points[:, 2] - _PLINTH_HEIGHT / 2) - (_PLINTH_HEIGHT / 2 - edge)
     outside = np.hypot(np.maximum(radial, 0), np.maximum(axial, 0))
     distance = outside + np.minimum(np.maximum(radial, axial), 0) - edge
+    return blended_limbs(points, limbs, _BLEND, distance)
+
+
+def blended_limbs(points: np.ndarray, limbs: tuple, blend: float, distance: np.ndarray | None = None) -> np.ndarray:
+    """Approximate signed distance to tapered capsules that run into one another, [points].
+
+    limbs: (start, end, start radius, end radius) of each. blend: width of the transition. distance: to what they run
+        into, besides each other.
+    """
+    distance = np.full(len(points), np.inf) if distance is None else distance
     for start, end, start_radius, end_radius in limbs:
         axis = np.subtract(end, start)
         along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
         limb = np.linalg.norm(points - start - along[:, None] * axis, axis=1)
         limb -= start_radius + along * (end_radius - start_radius)
         # Polynomial smooth minimum.
-        overlap = np.maximum(_BLEND - np.abs(distance - limb), 0) / _BLEND
-        distance = np.minimum(distance, limb) - overlap**2 * _BLEND / 4
+        overlap = np.maximum(blend - np.abs(distance - limb), 0) / blend
+        distance = np.minimum(distance, limb) - overlap**2 * blend / 4
     return distance

@@ -5,13 +5,11 @@ The scene of figures 7 and 11 of Jeng 2005, whose lamp hangs a little above the 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import mujoco
 
-from sims import add_material, dimmed, draw_box, new_stage, step_frames
+from sims import add_material, dimmed, draw_box, new_stage, rest
 
 if TYPE_CHECKING:
     import warp_psf as psf
@@ -32,6 +30,7 @@ BOXES = (
     (-0.62, 1.10, 0.28, 0.24, "green"),
 )
 LAMP_HEIGHT, LAMP_SIDE = 1.75, 0.7
+states = rest
 
 
 def build() -> mujoco.MjModel:
@@ -47,11 +46,6 @@ def build() -> mujoco.MjModel:
         half = side / 2
         draw_box(spec.worldbody, f"box {number}", (x - half, y - half, 0.0), (x + half, y + half, height), material)
     return spec.compile()
-
-
-def states(model: mujoco.MjModel, frames_per_second: float = 30, duration: float = math.inf) -> Iterator[mujoco.MjData]:
-    """The state at each frame, which is always the same."""
-    return step_frames(model, mujoco.MjData(model), frames_per_second, duration)
 
 
 def lights() -> tuple:

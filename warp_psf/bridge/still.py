@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,6 +11,8 @@ import numpy as np
 from warp_psf.bridge.cameras import find_camera, read_camera
 from warp_psf.bridge.deforming import meet_deforming, read_deformed
 from warp_psf.bridge.entities import build_scene, read_poses
+from warp_psf.scene.mesh import Mesh
+from warp_psf.scene.primitives import box, plane
 from warp_psf.scene.scene import Entity, Scene
 from warp_psf.scene.still import Piece, StillScene, join_pieces
 from warp_psf.scene.texture import decode
@@ -56,9 +59,20 @@ def freeze_scene(
                 pieces.append(Piece(body.vertices, body.normals, mesh.faces, _albedo(scene, entity)))
         elif entity.casts:
             rotation = poses.rotation[0, index].astype(np.float64)
+            mesh, albedo = _unrefined(mesh, _albedo(scene, entity))
             vertices = mesh.vertices @ rotation.T + poses.position[0, index]
-            pieces.append(Piece(vertices, mesh.normals @ rotation.T, mesh.faces, _albedo(scene, entity)))
+            pieces.append(Piece(vertices, mesh.normals @ rotation.T, mesh.faces, albedo))
     return join_pieces(pieces, views)
+
+
+def _unrefined(mesh: Mesh, albedo: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Boxes and rectangles of one colour with as few faces as they need: they are cut finely for shading vertices."""
+    if mesh.slab is None or (albedo != albedo[0]).any():
+        return mesh, albedo
+    center, rotation, half = mesh.slab
+    plain = plane(half[0], half[1], cells=1) if half[2] == 0.0 else box(half, cells=1)
+    placed = replace(plain, vertices=plain.vertices @ rotation.T + center, normals=plain.normals @ rotation.T)
+    return placed, np.repeat(albedo[:1], len(placed.faces), axis=0)
 
 
 def _albedo(scene: Scene, entity: Entity) -> np.ndarray:
