@@ -5,7 +5,7 @@ import pytest
 
 from tests.oracles import polygon_form_factor, sphere_form_factor
 from tests.test_slab import ball, box, camera_at
-from warp_psf.area_light.layered import bake_layered_map
+from warp_psf.area_light.layered import PARTS, bake_layered_map
 from warp_psf.area_light.light_samples import sample_light
 from warp_psf.area_light.projection import project_forward, retrieve_backward, trace_view, upload_layers
 from warp_psf.scene.light import AreaLight, rectangle_light, sphere_light
@@ -40,7 +40,7 @@ def test_samples_lie_evenly_on_the_light():
     for count in (16, 64, 1000):
         samples = sample_light(LAMP, count)
         place = (samples.position - LAMP.position) @ LAMP.rotation / 0.4
-        assert samples.area * count == pytest.approx(0.64, rel=1e-6)
+        assert samples.area.sum() == pytest.approx(0.64, rel=1e-6)
         assert np.abs(place[:, 2]).max() < 1e-6 and np.abs(place).max() <= 1.0 + 1e-6
         assert np.abs(place[:, :2].mean(axis=0)).max() < 1.5 / np.sqrt(count) ** 1.5
         assert (place[:, :2] ** 2).mean(axis=0) == pytest.approx([1 / 3, 1 / 3], abs=1.0 / np.sqrt(count) ** 1.5)
@@ -81,13 +81,16 @@ def test_what_nothing_hides_is_all_visible_and_the_umbra_is_dark(scene):
     assert not picture.color[picture.surface == 5].any()
 
 
-def test_elements_are_one_per_cell_and_surface(scene):
+def test_a_cell_keeps_few_points_of_a_surface(scene):
     layered = bake_layered_map(scene, LAMP, 96, device="cpu")
     cell = np.repeat(np.arange(96 * 96), np.diff(layered.first))
     keys = cell * len(scene.flat) + layered.surface
-    assert len(np.unique(keys)) == len(keys)
+    _, counts = np.unique(keys, return_counts=True)
+    # Nine views through each cell.
+    assert counts.max() <= PARTS**2 and 4 < counts.mean() <= 9.5
     # Beside the boxes the views from the light's corners see what the middle one does not.
-    assert (np.diff(layered.first) > 1).mean() > 0.02
+    surfaces = np.bincount(np.unique(keys) // len(scene.flat), minlength=96 * 96)
+    assert (surfaces > 1).mean() > 0.02
 
 
 def test_forward_projection_agrees_with_rays(scene, layers):
@@ -102,15 +105,13 @@ def test_forward_projection_agrees_with_rays(scene, layers):
 def test_forward_projection_is_better_than_backward_where_samples_are_few(scene):
     camera = scene.cameras[0]
     few = upload_layers(bake_layered_map(scene, LAMP, 96, device="cpu"), scene, "cpu")
-    traced = trace_view(few, camera, WIDTH, HEIGHT).visibility
-    forward, backward = (
-        picture(few, camera, WIDTH, HEIGHT).visibility for picture in (project_forward, retrieve_backward)
-    )
+    traced = trace_view(few, camera, WIDTH, HEIGHT).color
+    forward, backward = (picture(few, camera, WIDTH, HEIGHT).color for picture in (project_forward, retrieve_backward))
     assert rmse(forward, traced) < 0.8 * rmse(backward, traced)
 
 
 def test_unhindered_colour_is_the_light_s(scene, layers):
-    """64 samples against the polygon's form factor: on the floor, 2 m away, within 2 %."""
+    """Gauss points against the polygon's form factor, on the floor, 2 m away; a pixel is off the middle by 1 %."""
     traced = trace_view(layers, scene.cameras[0], WIDTH, HEIGHT)
     layer = trace_view(
         upload_layers(bake_layered_map(floor_only(scene), LAMP, 32, device="cpu"), floor_only(scene), "cpu"),

@@ -2,7 +2,9 @@
 
 Reference views from points on and near the light find surface points. Seen from the light's middle each lies in a cell
 of the map; a cell keeps one point for each surface that it meets, with the share of the light that reaches it. The map
-of a flat light is a square before it, that of any other shape a cube about it.
+of a flat light is the half space before it, that of any other shape two of them. Directions lie on its square so that
+all cells are of one solid angle (Shirley 1997): a perspective map would spend most of them on what is right before the
+light, and see nothing beside it.
 """
 
 from dataclasses import dataclass
@@ -10,15 +12,25 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_psf.area_light.light_samples import LightSamples, LightTable, sample_light, upload_light, visible_ratio
+from warp_psf.area_light.light_samples import (
+    PLASTIC,
+    LightSamples,
+    LightTable,
+    sample_light,
+    sample_unshadowed,
+    upload_light,
+    visible_ratio,
+)
 from warp_psf.area_light.tracing import StillTable, meet, smooth_normal, upload_still
 from warp_psf.device import find_device, launch
 from warp_psf.scene.light import AreaLight
 from warp_psf.scene.still import StillScene
 
-# A flat light's map looks no further aside than this, as a tangent: 76 degrees. What is beyond is lit by less than a
-# 17th; and a fitted square is this much wider than what it covers.
-WIDEST, MARGIN = 4.0, 1.02
+# Rays along a side with which the base point finds out what the map must cover, and how much wider than that it is.
+PROBES, MARGIN = 128, 1.05
+# A cell keeps one point of a surface in each of so many parts along its sides: points of views that see it from aside
+# lie in between those of the first one.
+PARTS = 4
 # How far out on a light's diagonals, in half diagonals, reference points stand: at its corners, and outside it.
 CORNERS, OUTSIDE = 1.0, 1.5
 FARTHEST = wp.constant(1.0e6)
@@ -27,12 +39,12 @@ LARGEST_SIZE, MOST_SAMPLES = 4096, 4096
 
 @wp.struct
 class FrameTable:
-    """The square faces of a map: which direction each looks in, and how far it reaches."""
+    """The square faces of a map: a part of a half space each."""
 
     origin: wp.vec3  # the base point, world, metres
-    rotation: wp.array(dtype=wp.mat33)  # (face): world_from_face; it looks along its third axis
-    window: wp.array(dtype=wp.vec2)  # (face): middle of its square, tangents
-    half: wp.float32  # of its side, as a tangent
+    rotation: wp.array(dtype=wp.mat33)  # (face): world_from_face; the half space is about its third axis
+    middle: wp.vec2  # of the part, on the square from -1 to 1 that is the half space
+    half: wp.float32  # half the part's side
     size: wp.int32  # cells along it
 
 
@@ -40,20 +52,21 @@ class FrameTable:
 class LayeredMap:
     """A layered area light map. Built by `bake_layered_map`.
 
-    light: points on the light that shadows were asked of.
+    light: points on the light that shadows were asked of. unshadowed: those over which its light is summed.
     radiance: of the light, float64 [3].
-    origin: the base point, metres. rotation: world_from_face, float64 [faces, 3, 3]. window, half: middles of the
-        faces' squares [faces, 2] and half their side, tangents. size: cells along it.
+    origin: the base point, metres. rotation: world_from_face, float64 [faces, 3, 3]. middle, half: which part of the
+        half space's square, from -1 to 1, the map is: its middle [2] and half its side. size: cells along it.
     first: where each cell's elements begin, int32 [cells + 1]; a face's cells lie by rows.
     surface: of each element, int32 [E]. visibility: share of the light that arrives, float32 [E].
     position, normal: world, float32 [E, 3].
     """
 
     light: LightSamples
+    unshadowed: LightSamples
     radiance: np.ndarray
     origin: np.ndarray
     rotation: np.ndarray
-    window: np.ndarray
+    middle: np.ndarray
     half: float
     size: int
     first: np.ndarray
@@ -90,20 +103,24 @@ def bake_layered_map(
     still = upload_still(scene, on_device)
     points = sample_light(light, samples)
     base, references = _reference_points(light)
-    rotation, window, half = _faces(scene, light, base)
-    frame = make_frame(base, rotation, window, half, int(size), on_device)
+    rotation, middle, half = _faces(still.table, light, base, on_device)
+    frame = make_frame(base, rotation, middle, half, int(size), on_device)
     elements = _Elements(len(scene.flat))
-    for reference in references:
-        elements.add(*_look_from(still.table, frame, reference, on_device))
-    cell, kept = elements.sorted()
+    fine = make_frame(base, rotation, middle, half, PARTS * int(size), on_device)
+    for view, reference in enumerate(references):
+        # Each view's rays go through other places of the cells.
+        aside = (0.5 + view * PLASTIC) % 1.0
+        elements.add(*_look_from(still.table, frame, fine, reference, aside, on_device))
+    cell, kept = elements.sorted(int(size))
     visibility = _ask(still.table, upload_light(points, on_device), kept, on_device)
     first = np.searchsorted(cell, np.arange(len(rotation) * size**2 + 1)).astype(np.int32)
     return LayeredMap(
         points,
+        sample_unshadowed(light, samples),
         np.asarray(light.radiance, np.float64),
         base,
         rotation,
-        window,
+        middle,
         half,
         int(size),
         first,
@@ -126,33 +143,71 @@ def _reference_points(light: AreaLight) -> tuple[np.ndarray, np.ndarray]:
     return world[0], world
 
 
-def _faces(scene: StillScene, light: AreaLight, base: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotations, middles and half a side of the map's squares: one before a flat light, or a cube's six."""
+def _faces(
+    still: StillTable, light: AreaLight, base: np.ndarray, device: wp.Device
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotations of the map's faces, and which part of their squares meets the scene: its middle and half its side."""
     slab = light.mesh.slab
     if slab is None or slab[2][2] > 0.0:
-        x, y, z = np.eye(3)
-        axes = [(y, z, x), (z, x, y), (x, y, z), (-y, z, -x), (-z, x, -y), (-x, y, -z)]
-        return np.stack([np.stack(each, axis=1) for each in axes]), np.zeros((6, 2)), 1.0
-    rotation = light.rotation @ slab[1]
-    local = (scene.vertices - base) @ rotation
-    local = local[local[:, 2] > 0.0]
-    if not len(local):
+        return np.stack([light.rotation, light.rotation @ np.diag([1.0, -1.0, -1.0])]), np.zeros(2), 1.0
+    rotation = (light.rotation @ slab[1])[None]
+    whole = make_frame(base, rotation, np.zeros(2), 1.0, PROBES, device)
+    cell, _ = _look_from(still, whole, whole, base, np.full(2, 0.5), device)
+    if not len(cell):
         raise ValueError(f"nothing of the scene is before light {light.name!r}; turn it")
-    tangent = np.clip(local[:, :2] / local[:, 2:], -WIDEST, WIDEST)
-    low, high = tangent.min(axis=0), tangent.max(axis=0)
-    return rotation[None], 0.5 * (low + high)[None], MARGIN * 0.5 * float((high - low).max())
+    # A cell to each side, for what lies between rays.
+    low = np.array([(cell % PROBES).min() - 1, (cell // PROBES).min() - 1])
+    high = np.array([(cell % PROBES).max() + 2, (cell // PROBES).max() + 2])
+    middle = (low + high) / PROBES - 1.0
+    return rotation, middle * [1.0, -1.0], min(MARGIN * float((high - low).max()) / PROBES, 1.0)
 
 
 def make_frame(
-    origin: np.ndarray, rotation: np.ndarray, window: np.ndarray, half: float, size: int, device: wp.Device
+    origin: np.ndarray, rotation: np.ndarray, middle: np.ndarray, half: float, size: int, device: wp.Device
 ) -> FrameTable:
-    """Puts a map's squares on the device."""
+    """Puts a map's faces on the device."""
     frame = FrameTable()
     frame.origin = wp.vec3(*map(float, origin))
     frame.rotation = wp.array(rotation.astype(np.float32), dtype=wp.mat33, device=device)
-    frame.window = wp.array(window.astype(np.float32), dtype=wp.vec2, device=device)
+    frame.middle = wp.vec2(*map(float, middle))
     frame.half, frame.size = half, size
     return frame
+
+
+@wp.func
+def direction_of(x: float, y: float) -> wp.vec3:
+    """The direction at a point of the square from -1 to 1, in a face's frame. Equal areas have equal solid angles.
+
+    Source: Shirley and Chiu, A Low Distortion Map Between Disk and Square, 1997.
+    """
+    r = float(0.0)
+    angle = float(0.0)
+    if wp.abs(x) > wp.abs(y):
+        r = x
+        angle = wp.static(0.25 * np.pi) * y / x
+    elif y != 0.0:
+        r = y
+        angle = wp.static(0.5 * np.pi) - wp.static(0.25 * np.pi) * x / y
+    level = r * wp.sqrt(wp.max(2.0 - r * r, 0.0))
+    return wp.vec3(level * wp.cos(angle), level * wp.sin(angle), 1.0 - r * r)
+
+
+@wp.func
+def square_of(d: wp.vec3) -> wp.vec2:
+    """Where a direction of a face's half space, of unit length, lies on its square: the inverse of `direction_of`."""
+    r = wp.sqrt(wp.max(1.0 - d[2], 0.0))
+    angle = wp.atan2(d[1], d[0])
+    if angle < -wp.static(0.25 * np.pi):
+        angle += wp.static(2.0 * np.pi)
+    to_square = wp.static(4.0 / np.pi)
+    place = wp.vec2(to_square * (angle - wp.static(1.5 * np.pi)) * r, -r)
+    if angle < wp.static(0.25 * np.pi):
+        place = wp.vec2(r, to_square * angle * r)
+    elif angle < wp.static(0.75 * np.pi):
+        place = wp.vec2(-to_square * (angle - wp.static(0.5 * np.pi)) * r, r)
+    elif angle < wp.static(1.25 * np.pi):
+        place = wp.vec2(-r, -to_square * (angle - wp.static(np.pi)) * r)
+    return place
 
 
 @wp.func
@@ -160,12 +215,12 @@ def cell_of(frame: FrameTable, p: wp.vec3) -> int:
     """The cell of the map in which the base point sees p, -1 where no face looks."""
     found = int(-1)
     for face in range(frame.rotation.shape[0]):
-        local = wp.transpose(frame.rotation[face]) * (p - frame.origin)
-        if local[2] > 0.0 and found < 0:
-            window = frame.window[face]
-            u = 0.5 + 0.5 * (local[0] / local[2] - window[0]) / frame.half
-            v = 0.5 - 0.5 * (local[1] / local[2] - window[1]) / frame.half
-            # Two faces of a cube share their rim, which rounding must not lose.
+        local = wp.normalize(wp.transpose(frame.rotation[face]) * (p - frame.origin))
+        # Two faces share their rim, which rounding must not lose.
+        if found < 0 and local[2] > -1.0e-6:
+            place = square_of(local)
+            u = 0.5 + 0.5 * (place[0] - frame.middle[0]) / frame.half
+            v = 0.5 - 0.5 * (place[1] - frame.middle[1]) / frame.half
             if wp.min(u, v) > -1.0e-5 and wp.max(u, v) < 1.0 + 1.0e-5:
                 column = wp.clamp(int(u * float(frame.size)), 0, frame.size - 1)
                 row = wp.clamp(int(v * float(frame.size)), 0, frame.size - 1)
@@ -174,7 +229,7 @@ def cell_of(frame: FrameTable, p: wp.vec3) -> int:
 
 
 class _Elements:
-    """The points so far, one for each surface in a cell: that of the view which came first."""
+    """The points so far, one for each surface in a part of a cell: that of the view which came first."""
 
     def __init__(self, surfaces: int):
         self.surfaces = surfaces
@@ -188,21 +243,32 @@ class _Elements:
         self.keys = np.concatenate([self.keys, keys[new]])
         self.kept.append({name: values[first[new]] for name, values in found.items()})
 
-    def sorted(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """All points by their cells, and those [E]."""
-        order = np.argsort(self.keys, kind="stable")
+    def sorted(self, size: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """All points by the cells of a map of `size`, and those [E]."""
+        face, place = np.divmod(self.keys // self.surfaces, (PARTS * size) ** 2)
+        row, column = np.divmod(place, PARTS * size)
+        cell = (face * size + row // PARTS) * size + column // PARTS
+        order = np.lexsort((self.keys, cell))
         merged = {name: np.concatenate([each[name] for each in self.kept])[order] for name in self.kept[0]}
-        return self.keys[order] // self.surfaces, merged
+        return cell[order], merged
 
 
 def _look_from(
-    still: StillTable, frame: FrameTable, reference: np.ndarray, device: wp.Device
+    still: StillTable,
+    frame: FrameTable,
+    fine: FrameTable,
+    reference: np.ndarray,
+    aside: np.ndarray,
+    device: wp.Device,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """What a reference view sees: cells, and the points' surface, position, normal and that of their triangle."""
+    """What a reference view sees: cells of `fine`, the points' surface, position, normal and that of their triangle.
+
+    A ray goes through every cell of `frame`, at the place `aside` in it, from 0 to 1 [2].
+    """
     rays = frame.rotation.shape[0] * frame.size**2
     cell, surface = (wp.zeros((1, rays), dtype=wp.int32, device=device) for _ in range(2))
     vectors = [wp.zeros((1, rays), dtype=wp.vec3, device=device) for _ in range(3)]
-    inputs = [still, frame, wp.vec3(*map(float, reference))]
+    inputs = [still, frame, fine, wp.vec3(*map(float, reference)), wp.vec2(*map(float, aside))]
     launch(_find_points, (1, rays), inputs, [cell, surface, *vectors], device)
     there = cell.numpy()[0] >= 0
     names = ("position", "normal", "facing")
@@ -215,7 +281,9 @@ def _find_points(
     first: int,
     still: StillTable,
     frame: FrameTable,
+    fine: FrameTable,
     reference: wp.vec3,
+    aside: wp.vec2,
     cell_out: wp.array2d(dtype=wp.int32),  # (world, ray), -1: nothing that the map covers
     surface_out: wp.array2d(dtype=wp.int32),  # (world, ray)
     position_out: wp.array2d(dtype=wp.vec3),  # (world, ray)
@@ -226,13 +294,14 @@ def _find_points(
     ray += first
     face = ray / (frame.size * frame.size)
     place = ray % (frame.size * frame.size)
-    window = frame.window[face]
-    x = window[0] + frame.half * (2.0 * (float(place % frame.size) + 0.5) / float(frame.size) - 1.0)
-    y = window[1] + frame.half * (1.0 - 2.0 * (float(place / frame.size) + 0.5) / float(frame.size))
-    hit = meet(still, reference, frame.rotation[face] * wp.vec3(x, y, 1.0), FARTHEST)
+    x = frame.middle[0] + frame.half * (2.0 * (float(place % frame.size) + aside[0]) / float(frame.size) - 1.0)
+    y = frame.middle[1] + frame.half * (1.0 - 2.0 * (float(place / frame.size) + aside[1]) / float(frame.size))
     cell_out[world, ray] = -1
+    if wp.max(wp.abs(x), wp.abs(y)) >= 1.0:
+        return
+    hit = meet(still, reference, frame.rotation[face] * direction_of(x, y), FARTHEST)
     if hit.face >= 0:
-        cell_out[world, ray] = cell_of(frame, hit.position)
+        cell_out[world, ray] = cell_of(fine, hit.position)
         surface_out[world, ray] = hit.surface
         position_out[world, ray] = hit.position
         normal_out[world, ray] = smooth_normal(still, hit)

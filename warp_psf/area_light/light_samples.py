@@ -10,8 +10,8 @@ from warp_psf.scene.light import AreaLight
 
 # The plastic number's powers: points that fill the unit square evenly however many of them are taken.
 PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])
-# Points of a rectangle over which unshadowed light is summed: within 1 % at a distance of its side.
-ENOUGH = 36
+# Gauss-Legendre points along a rectangle's side: what it sends to a distance of half its side is right to a thousandth.
+GAUSS_POINTS = 4
 # Where these many samples agree, the others are not asked: a light of which less than a 64th is hidden, or seen, may
 # count as wholly so.
 ASKED_FIRST = wp.constant(64)
@@ -23,24 +23,23 @@ class LightTable:
 
     position: wp.array2d(dtype=wp.vec3)  # (world, sample), metres
     normal: wp.array2d(dtype=wp.vec3)  # (world, sample), the side that shines
-    area: wp.float32  # of each, m^2
-    enough: wp.int32  # so many of the first ones tell what arrives when nothing is in the way
+    area: wp.array2d(dtype=wp.float32)  # (world, sample), m^2
 
 
 @dataclass(frozen=True, eq=False)
 class LightSamples:
-    """Points on a light, each for the same area. Any first ones of them cover the light evenly.
+    """Points on a light.
 
-    position, normal: world, float64 [N, 3]. area: of each, m^2.
+    position, normal: world, float64 [N, 3]. area: that each stands for, m^2, float64 [N].
     """
 
     position: np.ndarray
     normal: np.ndarray
-    area: float
+    area: np.ndarray
 
 
 def sample_light(light: AreaLight, count: int) -> LightSamples:
-    """Points on a light that does not hang on a body.
+    """Points on a light that does not hang on a body, each for the same area; any first ones cover it evenly.
 
     Raises:
         ValueError: the light hangs on a body, or `count` is no whole number from 1 to 65536.
@@ -52,12 +51,8 @@ def sample_light(light: AreaLight, count: int) -> LightSamples:
     unit = (0.5 + np.arange(count)[:, None] * PLASTIC) % 1.0
     slab = light.mesh.slab
     if slab is not None and slab[2][2] == 0.0:
-        middle, rotation, half = slab
-        place = middle + (2.0 * unit - 1.0) * half[:2] @ rotation[:, :2].T
-        normal = np.broadcast_to(rotation[:, 2], place.shape)
-        return LightSamples(
-            light.position + place @ light.rotation.T, normal @ light.rotation.T, 4.0 * half[0] * half[1] / count
-        )
+        area = 4.0 * slab[2][0] * slab[2][1]
+        return _on_rectangle(light, 2.0 * unit - 1.0, np.full(count, area / count))
     corners = light.mesh.vertices[light.mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(normals, axis=1)
@@ -70,9 +65,27 @@ def sample_light(light: AreaLight, count: int) -> LightSamples:
     weights = np.stack([1.0 - root, root * (1.0 - unit[:, 1]), root * unit[:, 1]], axis=1)
     place = (weights[..., None] * corners[face]).sum(axis=1)
     normal = (normals / double[:, None])[face]
-    return LightSamples(
-        light.position + place @ light.rotation.T, normal @ light.rotation.T, 0.5 * float(double.sum()) / count
-    )
+    area = np.full(count, 0.5 * float(double.sum()) / count)
+    return LightSamples(light.position + place @ light.rotation.T, normal @ light.rotation.T, area)
+
+
+def sample_unshadowed(light: AreaLight, count: int) -> LightSamples:
+    """Points over which light that nothing hides is summed: few of a rectangle, `count` of any other shape."""
+    slab = light.mesh.slab
+    if slab is None or slab[2][2] > 0.0:
+        return sample_light(light, count)
+    place, weight = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+    x, y = np.meshgrid(place, place)
+    area = slab[2][0] * slab[2][1] * np.outer(weight, weight)
+    return _on_rectangle(light, np.stack([x.ravel(), y.ravel()], axis=1), area.ravel())
+
+
+def _on_rectangle(light: AreaLight, at: np.ndarray, area: np.ndarray) -> LightSamples:
+    """Points of a rectangular light at coordinates from -1 to 1 across it [N, 2]."""
+    middle, rotation, half = light.mesh.slab
+    place = middle + at * half[:2] @ rotation[:, :2].T
+    normal = np.broadcast_to(rotation[:, 2], place.shape)
+    return LightSamples(light.position + place @ light.rotation.T, normal @ light.rotation.T, area)
 
 
 def upload_light(samples: LightSamples, device: wp.Device) -> LightTable:
@@ -80,30 +93,31 @@ def upload_light(samples: LightSamples, device: wp.Device) -> LightTable:
     table = LightTable()
     table.position = wp.array(samples.position[None], dtype=wp.vec3, device=device)
     table.normal = wp.array(samples.normal[None], dtype=wp.vec3, device=device)
-    table.area = samples.area
-    # Of a body half the points look away, and they lie less evenly than on a rectangle.
-    flat = (samples.normal == samples.normal[0]).all()
-    table.enough = min(ENOUGH, len(samples.normal)) if flat else len(samples.normal)
+    table.area = wp.array(samples.area[None], dtype=wp.float32, device=device)
     return table
 
 
 @wp.func
-def sent_by(light: LightTable, world: int, sample: int, p: wp.vec3, n: wp.vec3) -> float:
-    """Irradiance at p that a sample of radiance 1 causes when nothing is in the way."""
+def sent_by(light: LightTable, world: int, sample: int, p: wp.vec3, facing: wp.vec3, n: wp.vec3) -> float:
+    """Irradiance at p that a sample of radiance 1 causes when nothing is in the way.
+
+    facing: normal of p's triangle, which must look at the sample too. n: the smooth one.
+    """
     offset = light.position[world, sample] - p
-    arriving = wp.dot(n, offset)
+    arriving = wp.where(wp.dot(facing, offset) > 0.0, wp.dot(n, offset), 0.0)
     leaving = -wp.dot(light.normal[world, sample], offset)
     squared = wp.max(wp.length_sq(offset), 1.0e-12)
-    return wp.where(arriving > 0.0 and leaving > 0.0, arriving * leaving * light.area / (squared * squared), 0.0)
+    area = light.area[world, sample]
+    return wp.where(arriving > 0.0 and leaving > 0.0, arriving * leaving * area / (squared * squared), 0.0)
 
 
 @wp.func
-def irradiance_of(light: LightTable, world: int, p: wp.vec3, n: wp.vec3) -> float:
-    """Irradiance at p of the light, for radiance 1, when nothing is in the way."""
+def irradiance_of(light: LightTable, world: int, p: wp.vec3, facing: wp.vec3, n: wp.vec3) -> float:
+    """Irradiance at p of all samples, for radiance 1, when nothing is in the way."""
     total = float(0.0)
-    for sample in range(light.enough):
-        total += sent_by(light, world, sample, p, n)
-    return total * float(light.position.shape[1]) / float(light.enough)
+    for sample in range(light.position.shape[1]):
+        total += sent_by(light, world, sample, p, facing, n)
+    return total
 
 
 @wp.func
@@ -112,7 +126,7 @@ def visible_ratio(
 ) -> float:
     """The share of a light's irradiance that reaches p: back-projection (Jeng 2005, section 4.2.1).
 
-    facing: normal of p's triangle, from which rays start. n: the smooth one. all: asks every sample, also where the
+    facing, n: as in `sent_by`. all: asks every sample, also where the
     first ones agree.
     """
     sent = float(0.0)
@@ -121,7 +135,7 @@ def visible_ratio(
     sample = int(0)
     count = light.position.shape[1]
     while sample < count:
-        form = sent_by(light, world, sample, p, n)
+        form = sent_by(light, world, sample, p, facing, n)
         if form > 0.0:
             sent += form
             if sees(still, p, facing, light.position[world, sample]):

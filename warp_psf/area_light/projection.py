@@ -32,6 +32,8 @@ WIDEST_SPLAT, WIDEST_FILTER = wp.constant(16), wp.constant(5)
 # Points belong to a pixel of their surface within so many of its footprints, and pixels to each other, where they rise
 # over each other's plane by less than this share of their distance: a surface that bends back upon itself is parted.
 FOOTPRINTS, SLOPE = wp.constant(3.0), wp.constant(0.5)
+# What is nearer to the light by more than this share lies before a point.
+BEHIND = wp.constant(0.98)
 # Visibility is summed in these parts, below a count in the highest 24 bits: 2^24 points in a pixel.
 PARTS, COUNT_SHIFT = wp.constant(wp.float32(65536.0)), wp.constant(wp.uint64(40))
 LARGEST_PICTURE = 16384
@@ -69,6 +71,7 @@ class DeviceLayers:
     frame: FrameTable
     layers: LayerTable
     light: LightTable
+    unshadowed: LightTable
     radiance: np.ndarray
     device: wp.Device
 
@@ -92,9 +95,9 @@ def upload_layers(layered: LayeredMap, scene: StillScene, device: str | None = N
     table.visibility = wp.array(layered.visibility, dtype=wp.float32, device=on_device)
     table.position = wp.array(layered.position, dtype=wp.vec3, device=on_device)
     table.normal = wp.array(layered.normal, dtype=wp.vec3, device=on_device)
-    frame = make_frame(layered.origin, layered.rotation, layered.window, layered.half, layered.size, on_device)
-    light = upload_light(layered.light, on_device)
-    return DeviceLayers(upload_still(scene, on_device), frame, table, light, layered.radiance, on_device)
+    frame = make_frame(layered.origin, layered.rotation, layered.middle, layered.half, layered.size, on_device)
+    lights = (upload_light(samples, on_device) for samples in (layered.light, layered.unshadowed))
+    return DeviceLayers(upload_still(scene, on_device), frame, table, *lights, layered.radiance, on_device)
 
 
 def project_forward(layers: DeviceLayers, camera: Camera, width: int, height: int) -> ShadowPicture:
@@ -157,7 +160,7 @@ def _look(layers: DeviceLayers, camera: Camera, width: int, height: int) -> tupl
     screen.surface = wp.zeros(shape, dtype=wp.int32, device=layers.device)
     for name in ("position", "normal", "facing", "color"):
         setattr(screen, name, wp.zeros(shape, dtype=wp.vec3, device=layers.device))
-    launch(_see_pixels, shape, [layers.still.table, layers.light, view], [screen], layers.device)
+    launch(_see_pixels, shape, [layers.still.table, layers.unshadowed, view], [screen], layers.device)
     return view, screen
 
 
@@ -182,7 +185,7 @@ def _see_pixels(first: int, still: StillTable, light: LightTable, view: ViewTabl
         screen_out.position[world, pixel] = hit.position
         screen_out.normal[world, pixel] = normal
         screen_out.facing[world, pixel] = hit.normal
-        irradiance = irradiance_of(light, world, hit.position, normal)
+        irradiance = irradiance_of(light, world, hit.position, hit.normal, normal)
         screen_out.color[world, pixel] = irradiance * wp.static(1.0 / np.pi) * still.albedo[hit.face]
 
 
@@ -251,7 +254,8 @@ def _fill_holes(
     world, pixel = wp.tid()
     pixel += first
     surface = screen.surface[world, pixel]
-    if surface < 0:
+    if wp.max(screen.color[world, pixel]) <= 0.0:
+        # Nothing is there, or what turns away from the light.
         return
     value = mean_of(sums[pixel])
     reach = int(0)
@@ -259,6 +263,10 @@ def _fill_holes(
     n = screen.normal[world, pixel]
     column = pixel % screen.width
     row = pixel / screen.width
+    if value < 0.0 and is_umbra(frame, layers, p, surface):
+        # At its rim, what the map knows within a cell's width.
+        known = look_up(frame, layers, p, surface)
+        value = wp.where(known[1] < cell_width(frame, p), wp.max(known[0], 0.0), 0.0)
     while value < 0.0 and reach < WIDEST_SPLAT:
         reach += 1
         total = float(0.0)
@@ -280,19 +288,22 @@ def _fill_holes(
         if count > 0.0:
             value = total / count
     if value < 0.0:
-        # What no reference view saw near here: what the map itself says, and dark where it says nothing.
-        value = wp.max(look_up(frame, layers, p, surface), 0.0)
+        # What no reference view saw for many pixels around: what the map itself says, and dark where it says nothing.
+        value = wp.max(look_up(frame, layers, p, surface)[0], 0.0)
     filled_out[world, pixel] = value
     reach_out[world, pixel] = reach
 
 
 @wp.func
-def look_up(frame: FrameTable, layers: LayerTable, p: wp.vec3, surface: int) -> float:
-    """The visibility that the map keeps for a surface in p's cell or one beside it; -1 where it keeps none."""
+def look_up(frame: FrameTable, layers: LayerTable, p: wp.vec3, surface: int) -> wp.vec2:
+    """The visibility of the map's nearest point of a surface in p's cell or, if there is none, one beside it.
+
+    And its distance, metres. A visibility of -1 says that there is none.
+    """
     cell = cell_of(frame, p)
     value = float(-1.0)
     if cell < 0:
-        return value
+        return wp.vec2(value, 1.0e30)
     faces = cell / (frame.size * frame.size)
     row = (cell / frame.size) % frame.size
     column = cell % frame.size
@@ -310,7 +321,27 @@ def look_up(frame: FrameTable, layers: LayerTable, p: wp.vec3, surface: int) -> 
                     if distance < nearest:
                         nearest = distance
                         value = layers.visibility[element]
-    return value
+    return wp.vec2(value, nearest)
+
+
+@wp.func
+def cell_width(frame: FrameTable, p: wp.vec3) -> float:
+    """Of the map's cell at p, metres: the square of side 2 is a half space of 2 pi."""
+    return wp.static(float(np.sqrt(2.0 * np.pi))) * frame.half / float(frame.size) * wp.length(p - frame.origin)
+
+
+@wp.func
+def is_umbra(frame: FrameTable, layers: LayerTable, p: wp.vec3, surface: int) -> bool:
+    """Whether no reference view saw p's surface in its cell of the map because another one lies before it."""
+    cell = cell_of(frame, p)
+    behind = bool(False)
+    if cell >= 0:
+        distance = BEHIND * wp.length(p - frame.origin)
+        for element in range(layers.first[cell], layers.first[cell + 1]):
+            if layers.surface[element] == surface and wp.length(layers.position[element] - frame.origin) >= distance:
+                return False
+            behind = behind or wp.length(layers.position[element] - frame.origin) < distance
+    return behind
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -324,7 +355,7 @@ def _smooth_surfaces(
     world, pixel = wp.tid()
     pixel += first
     surface = screen.surface[world, pixel]
-    if surface < 0:
+    if wp.max(screen.color[world, pixel]) <= 0.0:
         return
     p = screen.position[world, pixel]
     n = screen.normal[world, pixel]
@@ -340,7 +371,7 @@ def _smooth_surfaces(
             y = row + dy
             if x >= 0 and x < screen.width and y >= 0 and y < screen.height:
                 other = y * screen.width + x
-                if screen.surface[world, other] == surface:
+                if screen.surface[world, other] == surface and wp.max(screen.color[world, other]) > 0.0:
                     if belong_together(p, n, screen.position[world, other]):
                         # A tent.
                         weight = float((half + 1 - wp.abs(dx)) * (half + 1 - wp.abs(dy)))
@@ -360,8 +391,8 @@ def _retrieve_pixels(
     world, pixel = wp.tid()
     pixel += first
     surface = screen.surface[world, pixel]
-    if surface >= 0:
-        visibility_out[world, pixel] = wp.max(look_up(frame, layers, screen.position[world, pixel], surface), 0.0)
+    if wp.max(screen.color[world, pixel]) > 0.0:
+        visibility_out[world, pixel] = wp.max(look_up(frame, layers, screen.position[world, pixel], surface)[0], 0.0)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -374,7 +405,7 @@ def _trace_pixels(
 ):
     world, pixel = wp.tid()
     pixel += first
-    if screen.surface[world, pixel] >= 0:
+    if wp.max(screen.color[world, pixel]) > 0.0:
         visibility_out[world, pixel] = visible_ratio(
             still,
             light,
