@@ -23,7 +23,7 @@ COLUMNS, COLUMN_RADIUS = 28, 0.0032
 LEAN = math.radians(4.0)
 SEGMENTS, SIDES = 112, 12
 # Side of the smallest squares with which its points are as many as the paper's.
-SMALLEST = 0.00055
+SMALLEST = 0.00092
 states = rest
 
 

@@ -16,8 +16,11 @@ from warp_psf.area_light.scene_map import SceneMap, bake_scene_map
 from warp_psf.area_light.script import Script, play_script, read_script
 from warp_psf.area_light.slab import LightPlane, ShadowSlab, bake_shadow_slab, make_light_plane
 from warp_psf.area_light.splatting import DevicePoints, PointPicture, splat_points, upload_points
+from warp_psf.scene.camera import Camera
+from warp_psf.scene.still import StillScene, make_still
 
 __all__ = [
+    "Camera",
     "DeviceLayers",
     "DevicePoints",
     "LayeredMap",
@@ -29,10 +32,12 @@ __all__ = [
     "ShadowPicture",
     "ShadowSlab",
     "SlabView",
+    "StillScene",
     "bake_layered_map",
     "bake_scene_map",
     "bake_shadow_slab",
     "make_light_plane",
+    "make_still",
     "play_script",
     "project_forward",
     "read_script",

@@ -12,8 +12,9 @@ from warp_psf.area_light.tracing import ViewTable, make_view
 from warp_psf.device import find_device, launch
 from warp_psf.scene.camera import Camera
 
-# Points whose square and whose divided square are both narrower than this many pixels are left to the stand-in.
-FINEST = wp.constant(1.0)
+# Points whose divided square is narrower than this many pixels are left to it, their stand-in: it reaches beyond a
+# silhouette by its diagonal at most, a pixel.
+FINEST = wp.constant(0.7)
 # A square is shown by a stand-in a little before its points vanish: both judge by their own distance.
 OVERLAP = wp.constant(1.05)
 # Squares reach over one another by this share: pixel centres on the line between two belong to one of them.
