@@ -12,6 +12,7 @@ from warp_psf.cli.comparing import compare
 from warp_psf.cli.frames import run_simulation
 from warp_psf.cli.rendering import render
 from warp_psf.cli.slab import slab
+from warp_psf.cli.still import layered, points
 from warp_psf.cli.versions import info
 
 __all__ = ["app", "main", "run_simulation"]
@@ -24,7 +25,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (render, slab, bake, compare, info):
+for command in (render, slab, layered, points, bake, compare, info):
     app.command()(command)
 
 
