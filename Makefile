@@ -2,11 +2,12 @@
 #   make bowling    ten pins and a ball: frames, film and contact sheet in out/bowling
 #                   (likewise falling, statues, room, teapots, figure, cloth, chess, sunlit)
 #   make test       the tests            make check    ruff and pyright
+#   make coverage   the tests, and which share of the lines outside kernels they run
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: bowling falling statues room teapots figure cloth chess sunlit test check clean
+.PHONY: bowling falling statues room teapots figure cloth chess sunlit test coverage check clean
 .DELETE_ON_ERROR:
 
 bowling falling statues room teapots figure cloth chess sunlit: .venv/installed
@@ -14,6 +15,9 @@ bowling falling statues room teapots figure cloth chess sunlit: .venv/installed
 
 test: .venv/installed-dev
 	$(BIN)/python -m pytest $(ARGS)
+
+coverage: .venv/installed-dev
+	$(BIN)/python -m pytest --cov=warp_psf --cov-report=term $(ARGS)
 
 check: .venv/installed-dev
 	$(BIN)/ruff check .
