@@ -19,6 +19,7 @@ Needs the extra `validate`.
 
 import argparse
 import copy
+import importlib
 import json
 import statistics
 import time
@@ -123,7 +124,7 @@ def measure(mi: Any, case: Case, reference_samples: int) -> list[dict]:
 
 def moving_states(case: Case) -> tuple[mujoco.MjData, mujoco.MjData]:
     """The case's state a frame earlier, and its own."""
-    simulation = __import__(f"sims.{case.name}", fromlist=["states"])
+    simulation: Any = importlib.import_module(f"sims.{case.name}")
     duration = case.data.time + 0.5 / 30
     before, after = deque(map(copy.copy, simulation.states(case.model, 30, duration)), maxlen=2)
     return before, after
@@ -215,13 +216,12 @@ class MitsubaScene:
         if not denoise:
             picture = self.render(samples, seed)
             return time.perf_counter() - begin, picture
-        import mitsuba_oidn
-
+        denoiser: Any = importlib.import_module("mitsuba_oidn")
         layers = np.array(self.mi.render(self.scene, integrator=self.with_features, spp=samples, seed=seed))
         # Radiance, perhaps with alpha; then the features.
         color, features = np.ascontiguousarray(layers[..., :3]), layers[..., -6:]
         albedo, normal = np.ascontiguousarray(features[..., :3]), np.ascontiguousarray(features[..., 3:])
-        picture = np.array(mitsuba_oidn.denoise(color, albedo=albedo, normal=normal, hdr=True))
+        picture = np.array(denoiser.denoise(color, albedo=albedo, normal=normal, hdr=True))
         return time.perf_counter() - begin, picture.astype(np.float64)
 
 

@@ -14,6 +14,7 @@ from warp_psf.cli.rendering import render
 from warp_psf.cli.slab import slab
 from warp_psf.cli.still import layered, points
 from warp_psf.cli.versions import info
+from warp_psf.cli.viewing import view
 
 __all__ = ["app", "main", "run_simulation"]
 
@@ -25,7 +26,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (render, slab, layered, points, bake, compare, info):
+for command in (render, view, slab, layered, points, bake, compare, info):
     app.command()(command)
 
 
