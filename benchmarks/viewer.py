@@ -15,7 +15,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -119,7 +118,7 @@ def served(simulation: str, *extra: str) -> Iterator[tuple[str, float]]:
                 sys.exit(f"{' '.join(command)} has not opened")
             yield found[0], time.perf_counter() - start
         finally:
-            process.send_signal(signal.SIGINT)
+            process.terminate()
 
 
 @contextmanager

@@ -38,7 +38,7 @@ LAMP = (
 HEIGHT, WIDTH = 90, 160
 # The world's geoms come before those of bodies: the first after `WALLS`.
 ROD = 3
-GATHERING = "basis irradiances"
+GATHERING, SENDING = "basis irradiances", "light on proxies"
 
 
 def start(body: str, height: int = HEIGHT, width: int = WIDTH, *, header: str = "", **options):
@@ -171,12 +171,12 @@ def test_relighting_keeps_what_was_gathered():
     assert_same(first, fresh(ball, lamp))
     # Another camera.
     found, gathered = drawn(renderer, data, "left")
-    assert not gathered
+    assert not gathered and SENDING not in renderer.stage_seconds
     assert_same(found, fresh(ball, lamp, "left"))
     # Another light.
     data.mocap_pos[1] = (0.5, -0.2, 2.5)
     found, gathered = drawn(renderer, data)
-    assert not gathered
+    assert not gathered and SENDING in renderer.stage_seconds
     assert np.abs(found["indirect"] - first["indirect"]).max() > 0.01
     assert_same(found, fresh(ball, (0.5, -0.2, 2.5)))
     # Another place of a body, and back.
@@ -188,6 +188,16 @@ def test_relighting_keeps_what_was_gathered():
     found, gathered = drawn(renderer, data)
     assert gathered
     assert_same(found, first)
+
+
+def test_a_new_environment_is_sent_on():
+    renderer, data = start(WALLS + BALL + CAMERAS, 45, 80)
+    first, _ = drawn(renderer, data)
+    renderer.environment = np.full((4, 8, 3), 0.3)
+    other, _ = drawn(renderer, data)
+    assert np.abs(other["indirect"] - first["indirect"]).max() > 0.01
+    renderer.environment = SKY
+    assert_same(drawn(renderer, data)[0], first)
 
 
 def test_poses_that_were_skipped_are_not_taken_for_the_last():

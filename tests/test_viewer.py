@@ -15,9 +15,12 @@ import mujoco
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 import warp_psf as psf
 from warp_psf.bridge import freeze_scene, read_camera
+from warp_psf.cli import app
+from warp_psf.cli.viewing import read_simulation
 from warp_psf.motion import simulate
 from warp_psf.viewer import Look, open_viewer
 from warp_psf.viewer.develop import develop
@@ -332,6 +335,53 @@ def test_a_port_in_use_is_refused_in_a_sentence():
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=f"cannot listen at 127.0.0.1:{port}.*choose another --port"):
             check_free("127.0.0.1", port)
+
+
+SIMULATION = """
+import mujoco
+
+def build():
+    return mujoco.MjModel.from_xml_string(MODEL)
+
+def states(model, frames_per_second):
+    data = mujoco.MjData(model)
+    while True:
+        mujoco.mj_step(model, data)
+        yield data
+
+def environment():
+    return None
+"""
+
+
+def test_a_simulation_is_a_file_or_a_module_with_build_and_states(tmp_path):
+    path = tmp_path / "falling_ball.py"
+    path.write_text(SIMULATION.replace("MODEL", repr(MODEL)), encoding="utf-8")
+    own = read_simulation(str(path), None)
+    assert next(own.states(own.model, 30)).time > 0.0
+    assert own.environment is None and own.lights == ()
+    named, short = read_simulation("sims.cubes", None), read_simulation("cubes", None)
+    assert named.model.ngeom == short.model.ngeom > 10
+    assert [light.name for light in short.lights] == ["lamp"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nowhere.xml"], "model 'nowhere.xml' does not exist"),
+        (["nowhere.py"], "simulation 'nowhere.py' does not exist"),
+        (["nowhere"], "'nowhere' is neither a model nor a simulation"),
+        (["sims.nowhere"], "'sims.nowhere' is neither a model nor a simulation"),
+        (["sims.furniture"], "sims.furniture has no build and no states"),
+        (["cubes", "--keyframe", "0"], "--keyframe 0: cubes is a simulation"),
+        (["cubes", "--camera", "back"], "camera 'back' does not exist"),
+        (["cubes", "--size", "big"], "--size big must be a width and a height"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_a_sentence(arguments, sentence):
+    result = CliRunner().invoke(app, ["view", *arguments, "--port", "0"])
+    assert result.exit_code == 2
+    assert sentence in result.output and "Traceback" not in result.output
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import warp as wp
@@ -69,6 +69,7 @@ class Stage:
     received, bounced: irradiance and Phong radiance at the surfaces' receivers, direct and after bounces.
     field_bytes: what is baked and kept, bytes: `occlusion` fields, `transfer`, basis `radiance` fields.
     room: for the scene's loose entity, None where it has none.
+    has_moved, is_lit_anew: whether bodies have moved, or lights have changed, since light was last sent on.
     seconds: how long each stage of the last frame took.
     """
 
@@ -95,6 +96,7 @@ class Stage:
     last_gather: LastGather | None
     field_bytes: dict[str, int]
     has_moved: bool = True
+    is_lit_anew: bool = True
     poses: Poses | None = None
     seen: tuple[Camera, tuple[DeltaLight, ...]] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -201,6 +203,7 @@ def relight(stage: Stage, environments: Sequence[Environment], background: Envir
         environments = [smooth for smooth, _ in cut]
         stage.sharp = write_leaves(stage.sharp, merge_leaves([leaves for _, leaves in cut]), 1, device)
     none = np.zeros((order * order, 3))
+    stage.is_lit_anew = True
     write_environment(stage.lighting, sum((each.project(order) for each in environments), none))
     behind = np.zeros((1, 1, 3), np.float32) if background is None else background.radiance
     stage.film = with_background(stage.film, behind)
@@ -209,6 +212,7 @@ def relight(stage: Stage, environments: Sequence[Environment], background: Envir
 def place(stage: Stage, poses: Poses, view: Camera, lights: tuple[DeltaLight, ...]) -> None:
     """Brings the state of a frame to the device: poses go up, nothing else does."""
     stage.has_moved = stage.has_moved or not _same_poses(poses, stage.poses)
+    stage.is_lit_anew = stage.is_lit_anew or stage.seen is None or not _same_lights(lights, stage.seen[1])
     stage.poses, stage.seen = poses, (view, lights)
     write_poses(stage.device_scene, poses)
     if not stage.surfaces.see_through and any_seen_from_behind(stage.scene, poses, view):
@@ -315,7 +319,19 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         with _timed(stage, "basis irradiances"):
             gather_basis_irradiances(bounces, scene, *lights, settings.bounce_threshold, device)
             tint_proxies(bounces, scene, stage.textures, device)
-        stage.has_moved = False
+    # Where only the camera has moved, the light on the bodies is as it was. Those that deform do so without a word.
+    if stage.has_moved or stage.is_lit_anew or stage.scene.deforming:
+        _light_proxies(stage, bounces)
+    stage.has_moved = stage.is_lit_anew = False
+    with _timed(stage, "last gather"):
+        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS)
+        shown = (stage.lattice, stage.received[0], stage.bounced)
+        gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
+
+
+def _light_proxies(stage: Stage, bounces: BounceState) -> None:
+    """Direct light on the proxies, and all bounces but the last gather."""
+    scene, device, lights = stage.device_scene, stage.settings.device, (stage.occlusion, stage.lighting)
     with _timed(stage, "light on proxies"):
         cuts, received = stage.cuts.proxies, bounces.received
         choose_cuts(cuts, bounces.proxies, stage.spheres, device)
@@ -328,11 +344,7 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         eye = stage.lighting.table.eye
         add_delta_lights(bounces.proxies, scene, eye, stage.delta_lights, *bounces.received, device)
     with _timed(stage, "bounces"):
-        bounce(bounces, scene, stage.occlusion, settings.bounces, device)
-    with _timed(stage, "last gather"):
-        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS)
-        shown = (stage.lattice, stage.received[0], stage.bounced)
-        gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
+        bounce(bounces, scene, stage.occlusion, stage.settings.bounces, device)
 
 
 def _make_see_through(stage: Stage) -> None:
@@ -382,6 +394,18 @@ def make_received(count: int, device: wp.Device) -> Received:
     return (
         wp.zeros((1, count), dtype=wp.vec3, device=device),
         wp.zeros((1, count), dtype=wp.vec3, device=device),
+    )
+
+
+def _same_lights(lights: tuple[DeltaLight, ...], others: tuple[DeltaLight, ...]) -> bool:
+    """Whether lights shine alike."""
+    if len(lights) != len(others):
+        return False
+    names = [each.name for each in fields(DeltaLight)]
+    return all(
+        np.array_equal(getattr(light, name), getattr(other, name))
+        for light, other in zip(lights, others, strict=True)
+        for name in names
     )
 
 

@@ -33,7 +33,7 @@ def view(
     slab: Annotated[
         bool, typer.Option("--slab", rich_help_panel=LIGHT, help="Paint a light over the scene, which rests.")
     ] = False,
-    samples: Annotated[str, option(LIGHT, "Light samples of --slab across and along its plane.", "WxH")] = "7x7",
+    samples: Annotated[int, option(LIGHT, "Light samples along each side of --slab.", "N", min=1, max=64)] = 7,
     environment: Annotated[
         str | None, option(LIGHT, f"studio, sky, sunset, overcast, an EXR or HDR file, or {NO_ENVIRONMENT}.", "E")
     ] = None,
@@ -58,10 +58,9 @@ def view(
     """
     with one_sentence("the viewer is closed"):
         width, height = parse_size(size)
-        columns, rows = parse_size(samples)
         from warp_psf.viewer import Look, open_viewer
 
-        seen = _read(source, keyframe)
+        seen = read_simulation(source, keyframe)
         if environment is not None:
             seen = seen._replace(environment=None if environment == NO_ENVIRONMENT else environment)
         with progress_bar() as bar:
@@ -76,7 +75,7 @@ def view(
                 camera=camera,
                 frames_per_second=fps,
                 pixels=width * height,
-                slab=(rows, columns) if slab else None,
+                slab=(samples, samples) if slab else None,
                 host=host,
                 port=port,
                 device=device,
@@ -96,7 +95,7 @@ class Simulation(NamedTuple):
     lights: tuple = ()
 
 
-def _read(source: str, keyframe: str | None) -> Simulation:
+def read_simulation(source: str, keyframe: str | None) -> Simulation:
     """The simulation that a person named.
 
     Raises:
