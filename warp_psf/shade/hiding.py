@@ -81,6 +81,25 @@ def make_hiding(order: int) -> SimpleNamespace:
         return True
 
     @wp.func
+    def distance_to(
+        toward: wp.vec3,
+        shape: int,
+        offset: wp.vec3,
+        radius: float,
+        to_frame: wp.mat33,
+        at: wp.vec3,
+        half: wp.vec3,
+        seen: Silhouette,
+        s: SharpTables,
+    ) -> float:
+        """The angle from a direction to an entity's silhouette, above zero within it."""
+        if shape == wp.static(SPHERE_SHAPE):
+            return sphere_distance(toward, offset, radius)
+        if shape == wp.static(SLAB_SHAPE):
+            return slab_distance(to_frame * toward, at, half)
+        return silhouette_distance(s[0].silhouettes, seen, to_frame * toward)
+
+    @wp.func
     def hide_by(
         visible: shares,
         world: int,
@@ -124,35 +143,29 @@ def make_hiding(order: int) -> SimpleNamespace:
                 direction = asked.direction
                 radius = asked.radius
             covered = float(0.0)
-            parts = wp.where(source < 0, 1, wp.static(PARTS))
             if source >= 0 and error > 0.0:
-                parts = 0
                 origin = p + (wp.static(SHADOW_OFFSET) * placed.radius) * n
                 mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
                 origin = wp.transpose(placed.rotation) * (origin - placed.position)
-                covered = float(wp.static(PARTS)) * ray_share(mesh, origin, to_frame * direction, radius, placed.radius)
-            for part in range(parts):
-                toward = direction
-                if source >= 0:
-                    toward = part_direction(direction, radius, part)
-                distance = float(0.0)
-                if shape == wp.static(SPHERE_SHAPE):
-                    distance = sphere_distance(toward, offset, placed.radius)
-                elif shape == wp.static(SLAB_SHAPE):
-                    distance = slab_distance(to_frame * toward, at, half)
-                else:
-                    distance = silhouette_distance(s[0].silhouettes, seen, to_frame * toward)
-                if source < 0:
-                    covered = distance
-                else:
-                    covered += disc_share(distance, wp.static(PART_RADIUS) * radius)
-            if source < 0:
-                if covered <= -radius - error:
-                    return visible
-                if covered >= radius + error:
-                    return (1.0 - weight) * visible
+                covered = ray_share(mesh, origin, to_frame * direction, radius, placed.radius)
             else:
-                result[source] = result[source] * (1.0 - weight * covered * wp.static(1.0 / PARTS))
+                distance = distance_to(direction, shape, offset, placed.radius, to_frame, at, half, seen, s)
+                if source < 0:
+                    if distance <= -radius - error:
+                        return visible
+                    if distance >= radius + error:
+                        return (1.0 - weight) * visible
+                elif wp.abs(distance) >= radius:
+                    # All of the source is on one side of the silhouette.
+                    covered = wp.where(distance > 0.0, 1.0, 0.0)
+                else:
+                    parts = int(wp.static(PARTS))
+                    for part in range(parts):
+                        toward = part_direction(direction, radius, part)
+                        aside = distance_to(toward, shape, offset, placed.radius, to_frame, at, half, seen, s)
+                        covered += wp.static(1.0 / PARTS) * disc_share(aside, wp.static(PART_RADIUS) * radius)
+            if source >= 0:
+                result[source] = result[source] * (1.0 - weight * covered)
             source += 1
         return result
 
@@ -270,4 +283,25 @@ def make_hiding(order: int) -> SimpleNamespace:
                         visible = hide_by_sheet(visible, world, sheet, p, n, weight, group, poses, o, s)
         return visible
 
-    return SimpleNamespace(visible_of=visible_of)
+    @wp.func
+    def is_open(
+        world: int,
+        own: int,
+        p: wp.vec3,
+        n: wp.vec3,
+        group: Group,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+    ) -> bool:
+        """Whether no entity but `own` can hide anything of a group: most groups at most points."""
+        if o[0].spheres[0].leaves.shape[0] + o[0].sheet_entity.shape[0] > 0:
+            return False
+        for entity in range(geometry[0].entity_mesh.shape[0]):
+            if o[0].occluders.opacity[entity] > 0.0 and entity != own:
+                placed = find_placed(world, entity, geometry, poses)
+                if is_in_way(entity, p, n, placed, group, o):
+                    return False
+        return True
+
+    return SimpleNamespace(visible_of=visible_of, is_open=is_open)

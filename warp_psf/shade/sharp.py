@@ -32,7 +32,8 @@ from warp_psf.shade.sources import Group, SharpTable, SharpTables, Source, group
 @cache
 def make_sharp(order: int) -> SimpleNamespace:
     """The kernels over the tables of `order` bands."""
-    kit, visible_of = make_direct(order), make_hiding(order).visible_of
+    kit, hiding = make_direct(order), make_hiding(order)
+    visible_of, is_open = hiding.visible_of, hiding.is_open
     OcclusionTables, LightingTables, Surface = kit.OcclusionTables, kit.LightingTables, kit.Surface
     area, evaluate = make_area(order), sh.make_sh(order).evaluate
 
@@ -188,8 +189,15 @@ def make_sharp(order: int) -> SimpleNamespace:
         """The light of all small sources at a receiver."""
         surface = kit.surface_of(world, receiver, receivers, geometry, poses, lighting)
         received = Received()
+        # A matt surface with nothing before it receives a group's light as one vector.
+        plain = surface.first_transfer < 0 and wp.max(geometry[0].specular[surface.entity]) == 0.0
         for index in range(s[0].axis.shape[1] + s[0].light_entity.shape[0]):
             group = group_of(world, index, surface.position, geometry, poses, s)
+            if plain and group.light < 0:
+                if wp.dot(surface.normal, group.axis) > group.sine:
+                    if is_open(world, surface.entity, surface.position, surface.normal, group, geometry, poses, o):
+                        received.diffuse += s[0].moment[world, group.number] * surface.normal
+                        continue
             # Below the horizon as a whole, or the receiver's own body.
             above = wp.dot(surface.normal, group.axis) > -group.sine
             if group.light >= 0:
