@@ -30,6 +30,8 @@ class PointLists:
     smallest: side of the last list's squares, metres; each list's are twice as wide as the next one's.
     origin, axes, normal: of each triangle's plane, world: float64 [T, 3], [T, 2, 3], float64 [T, 3].
     albedo: of each triangle, linear, float32 [T, 3].
+    sides: of each triangle's sides, inward unit normal and offset in its plane, metres, float64 [T, 3, 3]: (x, y, 1)
+        times them is how far a point lies within the sides.
     cell: column and row of each point's square on its triangle's grid, in squares of its list, int32 [points, 2].
     first: of each group, int64 [groups + 1].
     triangle, level: of each group, int32 [groups]; lists are counted from 0.
@@ -43,6 +45,7 @@ class PointLists:
     axes: np.ndarray
     normal: np.ndarray
     albedo: np.ndarray
+    sides: np.ndarray
     cell: np.ndarray
     first: np.ndarray
     triangle: np.ndarray
@@ -83,11 +86,12 @@ def sample_points(scene: StillScene, *, smallest: float | None = None, levels: i
     if area.sum() / largest**2 > MOST_POINTS:
         raise ValueError(f"squares of {smallest:g} m make more than {MOST_POINTS} points; give a larger `smallest`")
     origin, axes, normal, flat = _planes(corners)
+    sides = _sides(flat)
     lists = []
     triangle, cell = _covering(flat, largest)
     for level in range(levels):
         size = smallest * 2.0 ** (levels - 1 - level)
-        inside, met = _classify(flat, triangle, cell, size)
+        inside, met = _classify(flat, sides, triangle, cell, size)
         last = level == levels - 1
         leaf = met if last else inside
         divided = met & ~leaf
@@ -98,7 +102,7 @@ def sample_points(scene: StillScene, *, smallest: float | None = None, levels: i
         if len(triangle) > MOST_POINTS:
             raise ValueError(f"squares of {smallest:g} m make more than {MOST_POINTS} points; give a larger `smallest`")
     points = sum(np.bincount(each[2], minlength=len(flat)) for each in lists if not each[1])
-    return _grouped(lists, points == 1, smallest, levels, origin, axes, normal, scene.albedo)
+    return _grouped(lists, points == 1, smallest, levels, origin, axes, normal, scene.albedo, sides)
 
 
 def _planes(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -118,6 +122,14 @@ def _planes(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     return turned[:, 0], axes, normal, np.einsum("tcd,tad->tca", offset, axes)
 
 
+def _sides(flat: np.ndarray) -> np.ndarray:
+    """The inward unit normal and the offset of each side, float64 [T, 3, 3]. Corners run counter-clockwise."""
+    along = np.roll(flat, -1, axis=1) - flat
+    inward = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    inward /= np.maximum(np.linalg.norm(inward, axis=2, keepdims=True), 1e-30)
+    return np.concatenate([inward, -(inward * flat).sum(axis=2, keepdims=True)], axis=2)
+
+
 def _covering(flat: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
     """The squares of the coarsest grids that bound the triangles: triangle and cell of each."""
     low = np.floor(flat.min(axis=1) / size).astype(np.int64)
@@ -131,12 +143,11 @@ def _covering(flat: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
     return triangle, low[triangle] + np.stack([column, row], axis=1)
 
 
-def _classify(flat: np.ndarray, triangle: np.ndarray, cell: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+def _classify(
+    flat: np.ndarray, sides: np.ndarray, triangle: np.ndarray, cell: np.ndarray, size: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Whether each square lies inside its triangle, and whether it meets it at all."""
-    sides = np.roll(flat, -1, axis=1) - flat
-    # Of each side: the inward normal, for corners that run counter-clockwise in the plane.
-    inward = np.stack([-sides[..., 1], sides[..., 0]], axis=-1)
-    offset = -(inward * flat).sum(axis=2)
+    inward, offset = sides[..., :2], sides[..., 2]
     low, high = flat.min(axis=1), flat.max(axis=1)
     inside, met = np.empty(len(cell), bool), np.empty(len(cell), bool)
     for begin in range(0, len(cell), SQUARES_AT_A_TIME):
@@ -159,6 +170,7 @@ def _grouped(
     axes: np.ndarray,
     normal: np.ndarray,
     albedo: np.ndarray,
+    sides: np.ndarray,
 ) -> PointLists:
     """Points in groups: of each list and triangle, at most POINTS_PER_GROUP neighbours."""
     cells, sizes, triangles, level_of, stand_ins = [], [], [], [], []
@@ -184,6 +196,7 @@ def _grouped(
         axes,
         normal,
         albedo,
+        sides,
         np.concatenate(cells).astype(np.int32),
         np.concatenate([[0], np.cumsum(np.concatenate(sizes))]).astype(np.int64),
         triangle,

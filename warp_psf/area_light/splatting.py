@@ -22,6 +22,12 @@ REACH = wp.constant(0.501)
 # A list's splats hide those of larger lists unless they lie behind them by more than this many of their squares.
 THRESHOLD = wp.constant(2.0)
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
+# Splats reach beyond their triangle by half a pixel, and by half a smallest square at most: silhouettes are within a
+# pixel however near the viewer is, and what is narrower than a pixel still meets the middle of one.
+OVERHANG = wp.constant(0.5)
+# A square whose nearest corner has less than this share of its middle's depth may be anywhere in the picture: so close
+# to the camera's plane, bounds of its projection are no bounds.
+SHALLOWEST = wp.constant(0.02)
 LARGEST_PICTURE = 16384
 
 
@@ -34,6 +40,7 @@ class PointTable:
     up: wp.array(dtype=wp.vec3)  # (triangle): second axis
     normal: wp.array(dtype=wp.vec3)  # (triangle)
     albedo: wp.array(dtype=wp.vec3)  # (triangle)
+    sides: wp.array(dtype=wp.mat33)  # (triangle): (x, y, 1) times it, in its plane, is how far within, metres
     cell: wp.array(dtype=wp.vec2i)  # (point)
     first: wp.array(dtype=wp.int32)  # (group), and the number of points
     triangle: wp.array(dtype=wp.int32)  # (group)
@@ -82,6 +89,7 @@ def upload_points(lists: PointLists, device: str | None = None) -> DevicePoints:
     vectors = {"origin": lists.origin, "right": lists.axes[:, 0], "up": lists.axes[:, 1]}
     for name, values in (vectors | {"normal": lists.normal, "albedo": lists.albedo}).items():
         setattr(table, name, wp.array(values.astype(np.float32), dtype=wp.vec3, device=on_device))
+    table.sides = wp.array(lists.sides.astype(np.float32), dtype=wp.mat33, device=on_device)
     table.cell = wp.array(lists.cell[place], dtype=wp.vec2i, device=on_device)
     table.first = wp.array(np.append(begin, counts.sum()).astype(np.int32), dtype=wp.int32, device=on_device)
     table.triangle = wp.array(lists.triangle[order], dtype=wp.int32, device=on_device)
@@ -113,7 +121,7 @@ def splat_points(points: DevicePoints, camera: Camera, width: int, height: int) 
     level.fill_(-1)
     for number, ((begin, end), size) in enumerate(zip(points.groups, points.sizes, strict=True)):
         keys.fill_(NOTHING)
-        inputs = [points.table, view, begin, size, number == len(points.sizes) - 1, number == 0, width, height]
+        inputs = [points.table, view, begin, size, points.sizes[-1], number == 0, width, height]
         launch(_splat_groups, (1, end - begin), inputs, [keys.flatten(), used], device)
         launch(_merge_list, (1, pixels), [keys, number, size], [shown, level], device)
     color = wp.empty((1, pixels), dtype=wp.vec3, device=device)
@@ -149,6 +157,43 @@ def film_of(view: ViewTable, width: int, height: int) -> wp.mat33:
     return wp.mat33(across, 0.0, middle[0], 0.0, -down, middle[1], 0.0, 0.0, 1.0)
 
 
+@wp.func
+def splat_bounds(middle: wp.vec3, a: wp.vec3, b: wp.vec3, width: int, height: int) -> wp.vec4i:
+    """Columns, then rows, from where to where, that hold a square's projection.
+
+    middle: of the square, in homogeneous pixel coordinates; a, b: its two sides there.
+    """
+    across = 0.5 * (wp.abs(a[0]) + wp.abs(b[0]))
+    down = 0.5 * (wp.abs(a[1]) + wp.abs(b[1]))
+    deep = 0.5 * (wp.abs(a[2]) + wp.abs(b[2]))
+    farthest = middle[2] + deep
+    if middle[2] - deep < SHALLOWEST * wp.abs(middle[2]):
+        # Before the camera's plane, what is in the picture has 0 <= x <= width times its weight.
+        outside = middle[0] + across < 0.0 or middle[1] + down < 0.0
+        aside_x = middle[0] - float(width) * middle[2]
+        aside_y = middle[1] - float(height) * middle[2]
+        outside = outside or aside_x > 0.5 * (wp.abs(a[0] - float(width) * a[2]) + wp.abs(b[0] - float(width) * b[2]))
+        outside = outside or aside_y > 0.5 * (
+            wp.abs(a[1] - float(height) * a[2]) + wp.abs(b[1] - float(height) * b[2])
+        )
+        if outside or farthest <= 0.0:
+            return wp.vec4i(0, -1, 0, -1)
+        return wp.vec4i(0, width - 1, 0, height - 1)
+    weight = 1.0 / middle[2]
+    x = middle[0] * weight
+    y = middle[1] * weight
+    # The nearest corner has the least weight, and lies so much farther from the middle than without perspective.
+    reach = 0.5 / (middle[2] - deep)
+    reach_x = reach * (wp.abs(a[0] - x * a[2]) + wp.abs(b[0] - x * b[2])) + 0.01
+    reach_y = reach * (wp.abs(a[1] - y * a[2]) + wp.abs(b[1] - y * b[2])) + 0.01
+    # Before they become whole numbers, which hold less.
+    x_0 = wp.clamp(wp.ceil(x - reach_x - 0.5), 0.0, float(width))
+    x_1 = wp.clamp(wp.floor(x + reach_x - 0.5), -1.0, float(width) - 1.0)
+    y_0 = wp.clamp(wp.ceil(y - reach_y - 0.5), 0.0, float(height))
+    y_1 = wp.clamp(wp.floor(y + reach_y - 0.5), -1.0, float(height) - 1.0)
+    return wp.vec4i(int(x_0), int(x_1), int(y_0), int(y_1))
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _splat_groups(
     first: int,
@@ -156,7 +201,7 @@ def _splat_groups(
     view: ViewTable,
     begin: int,
     size: float,
-    last: bool,
+    smallest: float,
     largest: bool,
     width: int,
     height: int,
@@ -191,41 +236,38 @@ def _splat_groups(
     depth_of = wp.vec3(-right[2], -up[2], -place[2])
     stands_in = points.stands_in[group]
     alone = points.alone[group]
+    # Squares of the larger lists lie within their triangle: no side is near. Lengths are in squares from here on.
+    sides = wp.mat33()
+    if stands_in or size == smallest:
+        sides = points.sides[triangle] * wp.diag(wp.vec3(1.0, 1.0, 1.0 / size))
     focal = 0.5 * float(height) / view.half[1]
+    deep = 0.5 * (wp.abs(depth_of[0]) + wp.abs(depth_of[1]))
     used = int(0)
     for point in range(points.first[group], points.first[group + 1]):
         cell = points.cell[point]
         middle = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, 1.0)
-        weighted = onto * middle
         depth = wp.dot(depth_of, middle)
-        if depth > view.near and depth < view.far:
-            weight = 1.0 / weighted[2]
-            pixels = focal * size * weight
+        if depth + deep > view.near and depth - deep < view.far:
+            weighted = onto * middle
+            # Across the camera's plane a square is as wide as can be.
+            pixels = focal * size / wp.max(weighted[2], 1.0e-6)
             # Points that are too small to be seen leave their place to a stand-in, and the other way round.
             shows = alone or largest or 2.0 * pixels > FINEST
             if stands_in:
                 shows = pixels <= FINEST * OVERLAP and (largest or 2.0 * pixels > FINEST) and not alone
             if shows:
                 used += 1
-                x = weighted[0] * weight
-                y = weighted[1] * weight
-                reach_x = 0.5 * weight * (wp.abs(a[0] - x * a[2]) + wp.abs(b[0] - x * b[2]))
-                reach_y = 0.5 * weight * (wp.abs(a[1] - y * a[2]) + wp.abs(b[1] - y * b[2]))
-                # Perspective makes the nearer half of a large square wider than the farther one.
-                grow = 1.0 + 0.5 * weight * (wp.abs(a[2]) + wp.abs(b[2]))
-                x_0 = wp.max(int(wp.ceil(x - grow * reach_x - 0.51)), 0)
-                x_1 = wp.min(int(wp.floor(x + grow * reach_x - 0.49)), width - 1)
-                y_0 = wp.max(int(wp.ceil(y - grow * reach_y - 0.51)), 0)
-                y_1 = wp.min(int(wp.floor(y + grow * reach_y - 0.49)), height - 1)
-                for row in range(y_0, y_1 + 1):
-                    for column in range(x_0, x_1 + 1):
+                within = -OVERHANG * wp.min(smallest / size, 1.0 / pixels)
+                bounds = splat_bounds(weighted, a, b, width, height)
+                for row in range(bounds[2], bounds[3] + 1):
+                    for column in range(bounds[0], bounds[1] + 1):
                         at = back * wp.vec3(float(column) + 0.5, float(row) + 0.5, 1.0)
                         on_plane = wp.vec3(at[0] / at[2], at[1] / at[2], 1.0)
                         aside = wp.max(wp.abs(on_plane[0] - middle[0]), wp.abs(on_plane[1] - middle[1]))
-                        if aside <= REACH:
+                        if aside <= REACH and wp.min(sides * on_plane) >= within:
                             there = wp.dot(depth_of, on_plane)
                             key = (wp.uint64(bits_of(there)) << wp.uint64(32)) | wp.uint64(triangle)
-                            if there > 0.0:
+                            if there > view.near and there < view.far:
                                 lower_to(keys_out, row * width + column, key)
     add_to(used_out, 0, wp.uint64(used))
 
