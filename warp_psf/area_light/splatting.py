@@ -173,9 +173,7 @@ def splat_bounds(middle: wp.vec3, a: wp.vec3, b: wp.vec3, width: int, height: in
         aside_x = middle[0] - float(width) * middle[2]
         aside_y = middle[1] - float(height) * middle[2]
         outside = outside or aside_x > 0.5 * (wp.abs(a[0] - float(width) * a[2]) + wp.abs(b[0] - float(width) * b[2]))
-        outside = outside or aside_y > 0.5 * (
-            wp.abs(a[1] - float(height) * a[2]) + wp.abs(b[1] - float(height) * b[2])
-        )
+        outside = outside or aside_y > 0.5 * (wp.abs(a[1] - float(height) * a[2]) + wp.abs(b[1] - float(height) * b[2]))
         if outside or farthest <= 0.0:
             return wp.vec4i(0, -1, 0, -1)
         return wp.vec4i(0, width - 1, 0, height - 1)
