@@ -17,7 +17,7 @@ from sims.surfaces import Body, join, revolve, tube
 if TYPE_CHECKING:
     import warp_psf as psf
 
-# Metres: x and y of each, and a size.
+# Metres: x and y of each, and a size; of hedges, two corners.
 TREES = ((-1.5, 1.05, 1.0), (0.15, 1.2, 1.25), (1.75, 0.95, 0.9))
 POTS = ((-0.75, 0.15, 0.3), (0.95, 0.3, 0.24), (1.4, 0.1, 0.2))
 POSTS, POST_SPACING = 9, 0.42
@@ -70,9 +70,7 @@ def build() -> mujoco.MjModel:
     _draw_bench(world)
     for number, (x, y) in enumerate(STONES):
         draw_box(world, f"stone {number}", (x - 0.2, y - 0.14, 0.0), (x + 0.2, y + 0.14, 0.03), "stone")
-    for number, (low, high) in enumerate(
-        (((-2.9, 1.4), (-2.1, 1.7)), ((-0.9, 1.5), (-0.3, 1.75)), ((0.75, 1.5), (1.3, 1.75)))
-    ):
+    for number, (low, high) in enumerate(HEDGES):
         draw_box(world, f"hedge {number}", (*low, 0.0), (*high, 0.55), "leaves")
     draw_box(world, "lower step", (2.1, 0.9, 0.0), (2.8, 1.8, 0.15), "stone")
     draw_box(world, "upper step", (2.1, 1.25, 0.15), (2.8, 1.8, 0.3), "stone")

@@ -5,16 +5,11 @@ The scene of figure 17 of Jeng 2005: `lights()` are the five, in that order; cam
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import mujoco
 import numpy as np
 
 from sims import add_camera, add_material, add_mesh, draw_box, draw_mesh, new_stage, rest
 from sims.surfaces import Body, resample, revolve, rounded_path, tube
-
-if TYPE_CHECKING:
-    pass
 
 # Metres: the room's inner corners, the window in its right wall (y and z), and the wall's thickness.
 LOW, HIGH = (-2.0, -1.8, 0.0), (2.0, 1.8, 2.6)

@@ -53,6 +53,34 @@ def test_lights_shine_on_what_is_seen(frozen):
         assert max(lit) > 0.5, light.name
 
 
+def test_office_has_the_lights_of_figure_17():
+    assert [light.name for light in office.lights()] == ["ceiling", "wall", "left desk", "right desk", "moon"]
+
+
+def test_lamp_of_the_cubes_looks_down_on_the_highest_box():
+    (lamp,) = cubes.lights()
+    assert lamp.rotation[:, 2] == pytest.approx([0.0, 0.0, -1.0])
+    assert lamp.position[2] > max(height for *_, height, _ in cubes.BOXES)
+
+
+def test_lamp_grazes_the_wall_of_the_garden():
+    """Light comes at least 60 degrees off the wall's normal: less than half as many map samples lie on it."""
+    (lamp,) = garden.lights()
+    across, up = np.meshgrid(np.linspace(-3.0, 3.0, 13), np.linspace(0.0, 1.6, 5))
+    wall = np.stack([across, np.full_like(across, garden.WALL_Y), up], axis=-1)
+    towards = lamp.position - wall
+    cosine = -towards[..., 1] / np.linalg.norm(towards, axis=-1)
+    assert cosine.min() > 0.0
+    assert cosine.max() < 0.5
+
+
+def test_tower_is_as_many_points_as_in_figure_40():
+    """2,239,674 in three lists, within 2 % of which the smallest squares are chosen."""
+    scene = psf.freeze_scene(pisa.build())
+    counts = psf.area_light.sample_points(scene, smallest=pisa.SMALLEST, levels=3).counts
+    assert counts.sum() == pytest.approx(2_239_674, rel=0.02)
+
+
 def test_nothing_lies_under_the_floor(frozen):
     """The tower, which leans, dips into its lawn."""
     name, _, scene = frozen
