@@ -12,15 +12,15 @@ from warp_psf.area_light.tracing import ViewTable, make_view
 from warp_psf.device import find_device, launch
 from warp_psf.scene.camera import Camera
 
-# Points whose divided square is narrower than this many pixels are left to it, their stand-in: it reaches beyond a
-# silhouette by its diagonal at most, a pixel.
+# Points whose divided square is narrower than this many pixels are left to it, their stand-in: its diagonal is a pixel.
 FINEST = wp.constant(0.7)
 # A square is shown by a stand-in a little before its points vanish: both judge by their own distance.
 OVERLAP = wp.constant(1.05)
 # Squares reach over one another by this share: pixel centres on the line between two belong to one of them.
 REACH = wp.constant(0.501)
-# A list's splats hide those of larger lists unless they lie behind them by more than this many of their squares.
-THRESHOLD = wp.constant(2.0)
+# A list's splats hide those of larger lists unless they lie behind them by more than this many of their squares: as far
+# as a splat reaches beyond its triangle. With more, what is close behind a surface shows through it.
+THRESHOLD = wp.constant(0.5)
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 # Splats reach beyond their triangle by half a pixel, and by half a smallest square at most: silhouettes are within a
 # pixel however near the viewer is, and what is narrower than a pixel still meets the middle of one.
