@@ -142,10 +142,34 @@ def test_a_ball_of_light_has_a_map_all_around():
     assert len(np.unique(layered.surface)) == 6
     # Float32 puts some points of the walls' very edges outside the room.
     assert (layered.visibility == 1.0).mean() > 0.99
-    picture = trace_view(upload_layers(layered, inward, "cpu"), inward.cameras[0], 48, 48)
+    layers = upload_layers(layered, inward, "cpu")
+    picture = trace_view(layers, inward.cameras[0], 48, 48)
+    retrieved = retrieve_backward(layers, inward.cameras[0], 48, 48)
+    assert (retrieved.visibility[1:-1, 1:-1] == 1.0).mean() > 0.99
     expected = 2 * 0.8 * sphere_form_factor(np.array([[-1.0, 0, 0]]), np.array([[1.0, 0, 0]]), np.zeros(3), 0.15)[0]
     # Of 512 samples half face the wall.
     assert picture.color.max() == pytest.approx(expected, rel=0.02)
+
+
+def test_unhindered_light_is_the_sum_over_its_samples(scene):
+    """Against a float64 sum; 20 samples fill one block of sixteen, and four places of the next."""
+    camera = scene.cameras[0]
+    bulb = sphere_light("bulb", 0.3, (2, 2, 2), (0.4, 0.2, 1.5))
+    bare = floor_only(scene)
+    layers = upload_layers(bake_layered_map(bare, bulb, 16, samples=20, device="cpu"), bare, "cpu")
+    picture = trace_view(layers, camera, WIDTH, HEIGHT)
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5) / WIDTH, (np.arange(HEIGHT) + 0.5) / HEIGHT)
+    half = camera.half_sizes(WIDTH, HEIGHT)
+    film = np.stack([(2 * x - 1) * half[0], (1 - 2 * y) * half[1], -np.ones_like(x)], axis=-1)
+    ray = film @ np.asarray(camera.rotation).T
+    top = picture.surface == picture.surface[HEIGHT // 2, WIDTH // 2]
+    point = camera.position - ray[top] * (camera.position[2] / ray[top][:, 2:])
+    samples = sample_light(bulb, 20)
+    offset = samples.position - point[:, None]
+    leaving = np.maximum(-(samples.normal * offset).sum(axis=2), 0)
+    sent = (offset[..., 2] * leaving * samples.area / (offset**2).sum(axis=2) ** 2).sum(axis=1)
+    # Nothing hides the bulb's near half, and its far half sends nothing down. Float32 leaves six digits.
+    np.testing.assert_allclose(picture.color[top][:, 0], 2 * 0.8 / np.pi * sent, rtol=1e-4, atol=1e-6)
 
 
 def test_a_light_of_any_mesh_casts_shadows():

@@ -196,18 +196,13 @@ def direction_of(x: float, y: float) -> wp.vec3:
 def square_of(d: wp.vec3) -> wp.vec2:
     """Where a direction of a face's half space, of unit length, lies on its square: the inverse of `direction_of`."""
     r = wp.sqrt(wp.max(1.0 - d[2], 0.0))
-    angle = wp.atan2(d[1], d[0])
-    if angle < -wp.static(0.25 * np.pi):
-        angle += wp.static(2.0 * np.pi)
     to_square = wp.static(4.0 / np.pi)
-    place = wp.vec2(to_square * (angle - wp.static(1.5 * np.pi)) * r, -r)
-    if angle < wp.static(0.25 * np.pi):
-        place = wp.vec2(r, to_square * angle * r)
-    elif angle < wp.static(0.75 * np.pi):
-        place = wp.vec2(-to_square * (angle - wp.static(0.5 * np.pi)) * r, r)
-    elif angle < wp.static(1.25 * np.pi):
-        place = wp.vec2(-r, -to_square * (angle - wp.static(np.pi)) * r)
-    return place
+    if wp.abs(d[0]) > wp.abs(d[1]):
+        x = wp.where(d[0] < 0.0, -r, r)
+        return wp.vec2(x, to_square * x * wp.atan(d[1] / d[0]))
+    # Along the axis itself r is 0, and any angle will do.
+    y = wp.where(d[1] < 0.0, -r, r)
+    return wp.vec2(to_square * y * wp.atan(d[0] / wp.where(d[1] == 0.0, 1.0, d[1])), y)
 
 
 @wp.func

@@ -15,6 +15,11 @@ GAUSS_POINTS = 4
 # Where these many samples agree, the others are not asked: a light of which less than a 64th is hidden, or seen, may
 # count as wholly so.
 ASKED_FIRST = wp.constant(64)
+BLOCK = 16
+vec16 = wp.types.vector(length=BLOCK, dtype=wp.float32)
+# Times the metres by which a sample lies before a point's triangle, it bounds what the smooth normal makes of the
+# sample: by more than that can be, or by 0 behind the triangle.
+ANY_SHARE = wp.constant(wp.float32(1.0e30))
 
 
 @wp.struct
@@ -24,6 +29,19 @@ class LightTable:
     position: wp.array2d(dtype=wp.vec3)  # (world, sample), metres
     normal: wp.array2d(dtype=wp.vec3)  # (world, sample), the side that shines
     area: wp.array2d(dtype=wp.float32)  # (world, sample), m^2
+
+
+@wp.struct
+class BrightTable:
+    """Points on a light in blocks of sixteen, a coordinate each, so that a core sums a block at once."""
+
+    x: wp.array2d(dtype=vec16)  # (world, block), metres
+    y: wp.array2d(dtype=vec16)  # (world, block)
+    z: wp.array2d(dtype=vec16)  # (world, block)
+    normal_x: wp.array2d(dtype=vec16)  # (world, block), the side that shines
+    normal_y: wp.array2d(dtype=vec16)  # (world, block)
+    normal_z: wp.array2d(dtype=vec16)  # (world, block)
+    area: wp.array2d(dtype=vec16)  # (world, block), m^2; 0 of what fills the last block up
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +129,32 @@ def sent_by(light: LightTable, world: int, sample: int, p: wp.vec3, facing: wp.v
     return wp.where(arriving > 0.0 and leaving > 0.0, arriving * leaving * area / (squared * squared), 0.0)
 
 
+def upload_bright(samples: LightSamples, device: wp.Device) -> BrightTable:
+    """Puts points over which unhindered light is summed on the device."""
+    columns = np.concatenate([samples.position, samples.normal, samples.area[:, None]], axis=1).T
+    blocks = np.pad(columns, ((0, 0), (0, -len(samples.area) % BLOCK))).reshape(7, 1, -1, BLOCK)
+    table = BrightTable()
+    for name, values in zip(("x", "y", "z", "normal_x", "normal_y", "normal_z", "area"), blocks, strict=True):
+        setattr(table, name, wp.array(values, dtype=vec16, device=device))
+    return table
+
+
 @wp.func
-def irradiance_of(light: LightTable, world: int, p: wp.vec3, facing: wp.vec3, n: wp.vec3) -> float:
-    """Irradiance at p of all samples, for radiance 1, when nothing is in the way."""
+def irradiance_of(light: BrightTable, world: int, p: wp.vec3, facing: wp.vec3, n: wp.vec3) -> float:
+    """Irradiance at p of all samples, for radiance 1, when nothing is in the way: the sum of `sent_by`."""
     total = float(0.0)
-    for sample in range(light.position.shape[1]):
-        total += sent_by(light, world, sample, p, facing, n)
+    nothing = vec16()
+    for block in range(light.area.shape[1]):
+        x = light.x[world, block] - vec16(p[0])
+        y = light.y[world, block] - vec16(p[1])
+        z = light.z[world, block] - vec16(p[2])
+        before = wp.max(facing[0] * x + facing[1] * y + facing[2] * z, nothing)
+        arriving = wp.min(wp.max(n[0] * x + n[1] * y + n[2] * z, nothing), ANY_SHARE * before)
+        toward = wp.cw_mul(light.normal_x[world, block], x) + wp.cw_mul(light.normal_y[world, block], y)
+        leaving = wp.max(-toward - wp.cw_mul(light.normal_z[world, block], z), nothing)
+        squared = wp.max(wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z), vec16(1.0e-12))
+        form = wp.cw_div(wp.cw_mul(arriving, leaving), wp.cw_mul(squared, squared))
+        total += wp.dot(form, light.area[world, block])
     return total
 
 

@@ -11,7 +11,14 @@ import warp as wp
 
 from warp_psf.area_light.atomics import add_to
 from warp_psf.area_light.layered import FrameTable, LayeredMap, cell_of, make_frame
-from warp_psf.area_light.light_samples import LightTable, irradiance_of, upload_light, visible_ratio
+from warp_psf.area_light.light_samples import (
+    BrightTable,
+    LightTable,
+    irradiance_of,
+    upload_bright,
+    upload_light,
+    visible_ratio,
+)
 from warp_psf.area_light.tracing import (
     DeviceStill,
     StillTable,
@@ -45,8 +52,7 @@ class LayerTable:
 
     first: wp.array(dtype=wp.int32)  # (cell), and the number of elements
     surface: wp.array(dtype=wp.int32)  # (element)
-    visibility: wp.array(dtype=wp.float32)  # (element)
-    position: wp.array(dtype=wp.vec3)  # (element)
+    point: wp.array(dtype=wp.vec4)  # (element): position and visibility, which are read together
     normal: wp.array(dtype=wp.vec3)  # (element)
 
 
@@ -71,7 +77,7 @@ class DeviceLayers:
     frame: FrameTable
     layers: LayerTable
     light: LightTable
-    unshadowed: LightTable
+    unshadowed: BrightTable
     radiance: np.ndarray
     device: wp.Device
 
@@ -92,12 +98,12 @@ def upload_layers(layered: LayeredMap, scene: StillScene, device: str | None = N
     table = LayerTable()
     table.first = wp.array(layered.first, dtype=wp.int32, device=on_device)
     table.surface = wp.array(layered.surface, dtype=wp.int32, device=on_device)
-    table.visibility = wp.array(layered.visibility, dtype=wp.float32, device=on_device)
-    table.position = wp.array(layered.position, dtype=wp.vec3, device=on_device)
+    point = np.concatenate([layered.position, layered.visibility[:, None]], axis=1)
+    table.point = wp.array(point, dtype=wp.vec4, device=on_device)
     table.normal = wp.array(layered.normal, dtype=wp.vec3, device=on_device)
     frame = make_frame(layered.origin, layered.rotation, layered.middle, layered.half, layered.size, on_device)
-    lights = (upload_light(samples, on_device) for samples in (layered.light, layered.unshadowed))
-    return DeviceLayers(upload_still(scene, on_device), frame, table, *lights, layered.radiance, on_device)
+    light, bright = upload_light(layered.light, on_device), upload_bright(layered.unshadowed, on_device)
+    return DeviceLayers(upload_still(scene, on_device), frame, table, light, bright, layered.radiance, on_device)
 
 
 def project_forward(layers: DeviceLayers, camera: Camera, width: int, height: int) -> ShadowPicture:
@@ -166,14 +172,14 @@ def _look(layers: DeviceLayers, camera: Camera, width: int, height: int) -> tupl
 
 def _picture(layers: DeviceLayers, screen: ScreenTable, visibility: wp.array) -> ShadowPicture:
     shape = (screen.height, screen.width)
-    unshadowed = screen.color.numpy().reshape(*shape, 3)
-    share = np.where(unshadowed.any(axis=2), visibility.numpy().reshape(shape), np.float32(0.0))
-    color = unshadowed * share[..., None] * layers.radiance.astype(np.float32)
+    share = visibility.numpy().reshape(shape)
+    color = screen.color.numpy().reshape(*shape, 3) * share[..., None]
+    color *= layers.radiance.astype(np.float32)
     return ShadowPicture(color, share, screen.surface.numpy().reshape(shape))
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _see_pixels(first: int, still: StillTable, light: LightTable, view: ViewTable, screen_out: ScreenTable):
+def _see_pixels(first: int, still: StillTable, light: BrightTable, view: ViewTable, screen_out: ScreenTable):
     world, pixel = wp.tid()
     pixel += first
     x = (float(pixel % screen_out.width) + 0.5) / float(screen_out.width)
@@ -187,6 +193,12 @@ def _see_pixels(first: int, still: StillTable, light: LightTable, view: ViewTabl
         screen_out.facing[world, pixel] = hit.normal
         irradiance = irradiance_of(light, world, hit.position, hit.normal, normal)
         screen_out.color[world, pixel] = irradiance * wp.static(1.0 / np.pi) * still.albedo[hit.face]
+
+
+@wp.func
+def position_of(point: wp.vec4) -> wp.vec3:
+    # Of the element's own row: a table as a parameter would be copied, arrays and all, for every element.
+    return wp.vec3(point[0], point[1], point[2])
 
 
 @wp.func
@@ -206,7 +218,7 @@ def _project_points(
 ):
     world, element = wp.tid()
     element += first
-    p = layers.position[element]
+    p = position_of(layers.point[element])
     local = wp.transpose(view.rotation) * (p - view.position)
     depth = -local[2]
     scale = wp.where(view.orthographic, 1.0, 1.0 / wp.max(depth, 1.0e-6))
@@ -229,7 +241,7 @@ def _project_points(
     near = wp.length(p - q) <= FOOTPRINTS * footprint
     # Within half a pixel of its middle a point is the pixel's, whatever the rounding of its place says of slopes.
     if near and (wp.length(p - q) < 0.5 * footprint or belong_together(q, screen.normal[world, pixel], p)):
-        share = wp.uint64(PARTS * layers.visibility[element] + 0.5)
+        share = wp.uint64(PARTS * layers.point[element][3] + 0.5)
         add_to(sums_out, pixel, (wp.uint64(1) << COUNT_SHIFT) + share)
 
 
@@ -308,20 +320,22 @@ def look_up(frame: FrameTable, layers: LayerTable, p: wp.vec3, surface: int) -> 
     row = (cell / frame.size) % frame.size
     column = cell % frame.size
     nearest = float(1.0e30)
+    step = int(0)
     # The cell itself comes first.
-    for step in range(9):
+    while step < 9 and value < 0.0:
         place = (step + 4) % 9
         y = row + place / 3 - 1
         x = column + place % 3 - 1
-        if (value < 0.0 or step == 0) and y >= 0 and y < frame.size and x >= 0 and x < frame.size:
+        if y >= 0 and y < frame.size and x >= 0 and x < frame.size:
             at = (faces * frame.size + y) * frame.size + x
             for element in range(layers.first[at], layers.first[at + 1]):
                 if layers.surface[element] == surface:
-                    distance = wp.length(layers.position[element] - p)
-                    if distance < nearest:
-                        nearest = distance
-                        value = layers.visibility[element]
-    return wp.vec2(value, nearest)
+                    squared = wp.length_sq(position_of(layers.point[element]) - p)
+                    if squared < nearest:
+                        nearest = squared
+                        value = layers.point[element][3]
+        step += 1
+    return wp.vec2(value, wp.sqrt(nearest))
 
 
 @wp.func
@@ -338,9 +352,10 @@ def is_umbra(frame: FrameTable, layers: LayerTable, p: wp.vec3, surface: int) ->
     if cell >= 0:
         distance = BEHIND * wp.length(p - frame.origin)
         for element in range(layers.first[cell], layers.first[cell + 1]):
-            if layers.surface[element] == surface and wp.length(layers.position[element] - frame.origin) >= distance:
+            before = wp.length(position_of(layers.point[element]) - frame.origin) < distance
+            if layers.surface[element] == surface and not before:
                 return False
-            behind = behind or wp.length(layers.position[element] - frame.origin) < distance
+            behind = behind or before
     return behind
 
 
