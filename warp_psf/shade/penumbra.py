@@ -68,7 +68,4 @@ def slab_distance(direction: wp.vec3, p: wp.vec3, half: wp.vec3) -> float:
     if not found:
         # From inside everything is covered.
         return wp.static(1.0)
-    # The cone behind the eye has the same edges.
-    if wp.dot(direction, -p) < 0.0 and nearest > 0.0:
-        return -nearest
     return wp.asin(wp.clamp(nearest, -1.0, 1.0))
