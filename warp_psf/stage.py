@@ -273,10 +273,6 @@ def draw(stage: Stage) -> None:
         _shade_pixels(stage)
     else:
         _shade_vertices(stage, stage.vertices, stage.vertices_received)
-    if stage.sharp is not None:
-        with _timed(stage, "sharp light"):
-            lights = (stage.occlusion, stage.lighting, stage.sharp)
-            add_sharp_light(surfaces.receivers, scene, *lights, *stage.received, device)
     with _timed(stage, "shadow rays"):
         eye = stage.lighting.table.eye
         add_delta_lights(surfaces.receivers, scene, eye, stage.delta_lights, *stage.received, device)
@@ -289,13 +285,26 @@ def draw(stage: Stage) -> None:
 def _shade_pixels(stage: Stage) -> None:
     scene, device, pixels = stage.device_scene, stage.settings.device, stage.surfaces.receivers
     lattice, lights = stage.lattice, (stage.occlusion, stage.lighting)
-    with _timed(stage, "shadow fields"):
-        choose_cuts(stage.cuts.pixels, pixels, stage.spheres, device)
-        begin_lattice(lattice, pixels, stage.surfaces.extra, device)
-        for turn in range(1, len(STRIDES) + 1):
-            shade_direct(pixels, lattice.turns, turn, scene, *lights, stage.cuts.pixels, *stage.received, device)
+    choose_cuts(stage.cuts.pixels, pixels, stage.spheres, device)
+    begin_lattice(lattice, pixels, stage.surfaces.extra, device)
+    for turn in range(1, len(STRIDES) + 1):
+        whose = (lattice.turns, turn, scene)
+        with _timed(stage, "shadow fields"):
+            shade_direct(pixels, *whose, *lights, stage.cuts.pixels, *stage.received, device)
+        _add_sharp_light(stage, turn)
+        with _timed(stage, "lattice"):
             if turn < len(STRIDES):
                 refine_lattice(lattice, turn, pixels, *stage.received, device)
+
+
+def _add_sharp_light(stage: Stage, turn: int) -> None:
+    """Adds small sources to the light of the pixels' receivers whose turn it is."""
+    if stage.sharp is None:
+        return
+    device, whose = stage.settings.device, (stage.surfaces.receivers, stage.lattice.turns, turn)
+    with _timed(stage, "sharp light"):
+        lights = (stage.occlusion, stage.lighting, stage.sharp)
+        add_sharp_light(*whose, stage.device_scene, *lights, *stage.received, device)
 
 
 def _shade_vertices(stage: Stage, vertices: VertexReceivers, received: Received) -> None:
@@ -308,8 +317,9 @@ def _shade_vertices(stage: Stage, vertices: VertexReceivers, received: Received)
         shade_direct(vertices.receivers, vertices.turns, 1, scene, *lights, stage.cuts.vertices, *received, device)
     with _timed(stage, "interpolate vertices"):
         interpolate_vertices(vertices, pixels, scene, received, *stage.received, device)
-    # Every pixel receives bounced light by itself.
+    # Every pixel receives sharp and bounced light by itself.
     stage.lattice.turns.fill_(1)
+    _add_sharp_light(stage, 1)
 
 
 def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None:
@@ -338,7 +348,7 @@ def _light_proxies(stage: Stage, bounces: BounceState) -> None:
         shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, cuts, *received, device)
         shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, cuts, stage.delta_lights, received[0], device)
         if stage.sharp is not None:
-            add_sharp_light(bounces.proxies, scene, *lights, stage.sharp, *received, device)
+            add_sharp_light(bounces.proxies, bounces.turns, 1, scene, *lights, stage.sharp, *received, device)
             gloss = bounces.gloss.table
             add_sharp_moments(bounces.proxies, gloss.proxy, scene, *lights, stage.sharp, gloss.moment, device)
         eye = stage.lighting.table.eye
@@ -365,7 +375,7 @@ def _timed(stage: Stage, name: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     wp.synchronize_device(stage.settings.device)
-    stage.seconds[name] = time.perf_counter() - start
+    stage.seconds[name] = stage.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 def _transfers(bodies: list[BakedBody]) -> list[tuple[np.ndarray, np.ndarray] | None]:

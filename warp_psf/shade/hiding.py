@@ -158,6 +158,9 @@ def make_hiding(order: int) -> SimpleNamespace:
                 elif wp.abs(distance) >= radius:
                     # All of the source is on one side of the silhouette.
                     covered = wp.where(distance > 0.0, 1.0, 0.0)
+                elif group.light >= 0:
+                    # A light has pieces enough for what is thinner than it.
+                    covered = disc_share(distance, radius)
                 else:
                     parts = int(wp.static(PARTS))
                     for part in range(parts):

@@ -1,8 +1,8 @@
 """Which pixels are shaded, and which lie smoothly between shaded ones.
 
 The light that shadow fields give is smooth. Pixels are shaded on a lattice of every fourth pixel first. A cell of the
-lattice that shows one smooth surface, with nearly the same light at its corners, is interpolated; any other is
-shaded at every second pixel, and where that is still not smooth, at every pixel. Pixels on edges are always shaded.
+lattice that shows one smooth surface, over which light runs straight, is interpolated; any other is shaded at every
+second pixel, and where that is still not smooth, at every pixel. Pixels on edges are always shaded.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,14 @@ from warp_psf.scene.receiver import ReceiverTable
 
 # Spacings of the lattice, pixels, coarse to fine; a receiver is shaded in the turn of its spacing.
 STRIDES = (4, 2, 1)
-# A cell is interpolated when no channel differs between its corners by more than this share of the brightest corner,
-# and when the differences along its sides change from cell to cell by no more: the error of interpolation is an eighth
-# of that change, 0.5 %. The first alone would take a valley between equal corners for a plain.
-SMOOTH_LIGHT = wp.constant(0.04)
-# ... and when the normals in it lie within acos(0.97), 14 degrees.
-SMOOTH_NORMAL = wp.constant(0.97)
+# A cell is interpolated when the differences along its sides change from cell to cell by no more than this share of the
+# brightest corner: the error of interpolation is an eighth of that change, 0.5 %.
+BENT_LIGHT = wp.constant(0.04)
+# ... and when no channel differs between its corners by more than this share: what changes faster may change otherwise
+# between them.
+UNLIKE_LIGHT = wp.constant(0.2)
+# ... and when the normals in it lie within acos(0.93), 22 degrees.
+SMOOTH_NORMAL = wp.constant(0.93)
 # A receiver's turn: 0 waits, 1, 2, 3 are the strides' turns, and INTERPOLATED needs none.
 INTERPOLATED = 4
 
@@ -54,11 +56,11 @@ def _begin(
 
 
 @wp.func
-def nearly_equal(a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
-    """Whether the light at a cell's corners differs little."""
+def are_alike(a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
+    """Whether the light at a cell's corners is much the same."""
     highest = wp.max(wp.max(a, b), wp.max(c, d))
     lowest = wp.min(wp.min(a, b), wp.min(c, d))
-    return wp.max(highest - lowest) <= SMOOTH_LIGHT * wp.max(highest)
+    return wp.max(highest - lowest) <= UNLIKE_LIGHT * wp.max(highest)
 
 
 @wp.func
@@ -75,17 +77,20 @@ def bends(
     entity = receivers.entity[world, start]
     a = light[world, start]
     b = light[world, start + step]
+    # Either end by itself: where light bends one way and back again, the sum of both is none.
     bend = wp.vec3()
-    count = float(0.0)
+    known = bool(False)
     if has_before:
         if receivers.entity[world, start - step] == entity:
-            bend += light[world, start - step] - 2.0 * a + b
-            count += 1.0
+            bend = wp.abs(light[world, start - step] - 2.0 * a + b)
+            known = True
     if has_after:
         if receivers.entity[world, start + 2 * step] == entity:
-            bend += a - 2.0 * b + light[world, start + 2 * step]
-            count += 1.0
-    return wp.max(wp.max(bend, -bend)) > SMOOTH_LIGHT * count * wp.max(wp.max(a, b))
+            bend = wp.max(bend, wp.abs(a - 2.0 * b + light[world, start + 2 * step]))
+            known = True
+    if not known:
+        bend = wp.abs(a - b)
+    return wp.max(bend) > BENT_LIGHT * wp.max(wp.max(a, b))
 
 
 @wp.func
@@ -140,9 +145,9 @@ def is_smooth(
                 return False
             if wp.dot(receivers.normal[world, pixel], normal) < SMOOTH_NORMAL:
                 return False
-    if not nearly_equal(diffuse[world, corner], diffuse[world, right], diffuse[world, below], diffuse[world, across]):
+    if not are_alike(diffuse[world, corner], diffuse[world, right], diffuse[world, below], diffuse[world, across]):
         return False
-    if not nearly_equal(glossy[world, corner], glossy[world, right], glossy[world, below], glossy[world, across]):
+    if not are_alike(glossy[world, corner], glossy[world, right], glossy[world, below], glossy[world, across]):
         return False
     return not (
         has_bent_side(receivers, diffuse, world, corner, width, height, stride)

@@ -106,6 +106,7 @@ def make_sharp(order: int) -> SimpleNamespace:
         o: OcclusionTables,
         lighting: LightingTables,
         s: SharpTables,
+        with_moments: bool,
     ) -> Received:
         """Adds the light of a group of sources."""
         p = surface.position
@@ -126,6 +127,17 @@ def make_sharp(order: int) -> SimpleNamespace:
                 return received
         exponent = geometry[0].exponent[surface.entity]
         result = received
+        if group.light >= 0 and alone and not shines and not with_moments and wp.min(visible) == wp.max(visible):
+            # All pieces are visible by the same share.
+            light = s[0].light_radiance[world, group.light]
+            placed = find_placed(world, s[0].light_entity[group.light], geometry, poses)
+            entity = s[0].light_entity[group.light]
+            whole = area.area_irradiance(
+                entity, p, n, placed.position, placed.rotation, placed.center, placed.radius, o[0].occluders
+            )
+            if whole >= 0.0:
+                result.diffuse += (whole * visible[0]) * light
+                return result
         # Of a light: what its pieces send to here, and what of that arrives.
         sent = float(0.0)
         arrived = float(0.0)
@@ -185,8 +197,9 @@ def make_sharp(order: int) -> SimpleNamespace:
         o: OcclusionTables,
         lighting: LightingTables,
         s: SharpTables,
+        with_moments: bool,
     ) -> Received:
-        """The light of all small sources at a receiver."""
+        """The light of all small sources at a receiver; its moments only where they are asked for."""
         surface = kit.surface_of(world, receiver, receivers, geometry, poses, lighting)
         received = Received()
         # A matt surface with nothing before it receives a group's light as one vector.
@@ -207,13 +220,15 @@ def make_sharp(order: int) -> SimpleNamespace:
                 if wp.length_sq(facing) > 0.0:
                     above = above and wp.dot(facing, group.axis) < 0.0
             if above:
-                received = receive_group(received, world, group, surface, geometry, poses, o, lighting, s)
+                received = receive_group(received, world, group, surface, geometry, poses, o, lighting, s, with_moments)
         return received
 
     @wp.kernel(enable_backward=False, module="unique")
     def add_sharp(
         first: int,
         receivers: ReceiverTable,
+        turns: wp.array2d(dtype=wp.int32),  # (world, receiver)
+        turn: int,
         geometry: GeometryTables,
         poses: PoseTables,
         o: OcclusionTables,
@@ -224,9 +239,9 @@ def make_sharp(order: int) -> SimpleNamespace:
     ):
         world, receiver = wp.tid()
         receiver += first
-        if receivers.entity[world, receiver] < 0:
+        if turns[world, receiver] != turn or receivers.entity[world, receiver] < 0:
             return
-        received = receive(world, receiver, receivers, geometry, poses, o, lighting, s)
+        received = receive(world, receiver, receivers, geometry, poses, o, lighting, s, False)
         diffuse_out[world, receiver] = diffuse_out[world, receiver] + received.diffuse
         glossy_out[world, receiver] = glossy_out[world, receiver] + received.glossy
 
@@ -244,7 +259,7 @@ def make_sharp(order: int) -> SimpleNamespace:
     ):
         world, place = wp.tid()
         place += first
-        received = receive(world, glossy_proxy[place], proxies, geometry, poses, o, lighting, s)
+        received = receive(world, glossy_proxy[place], proxies, geometry, poses, o, lighting, s, True)
         moment_out[world, place] = moment_out[world, place] + received.moment
 
     return SimpleNamespace(add_sharp=add_sharp, add_sharp_moments=add_sharp_moments)
@@ -327,6 +342,8 @@ def _cone_of(direction: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, flo
 
 def add_sharp_light(
     receivers: ReceiverTable,
+    turns: wp.array,
+    turn: int,
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
@@ -335,10 +352,13 @@ def add_sharp_light(
     glossy: wp.array,
     device: wp.Device,
 ) -> None:
-    """Adds small sources to the receivers' irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, receiver)."""
+    """Adds small sources to irradiance `diffuse` and Phong radiance `glossy`, vec3 (world, receiver).
+
+    turns: int32 (world, receiver); of those whose turn it is.
+    """
     if state.is_empty:
         return
-    inputs = [receivers, scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.tables]
+    inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.tables]
     launch(make_sharp(state.order).add_sharp, diffuse.shape, inputs, [diffuse, glossy], device)
 
 
