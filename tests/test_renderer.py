@@ -151,7 +151,7 @@ def test_stages_are_timed():
     assert list(stages) == [
         "primary visibility",
         "turn fields",
-        "shadow fields",
+        "lattice",
         "shadow rays",
         "basis irradiances",
         "light on proxies",
@@ -283,8 +283,9 @@ def test_turning_several_occluders_changes_little():
 
 
 def test_vertex_shading_is_like_pixel_shading():
-    # On a ball, whose vertices are dense; the picture of the floor depends on its 64 x 64 cells of 12 cm.
-    layers = {shading: turned(np.eye(3), shading=shading) for shading in ("pixel", "vertex")}
+    # On a ball, whose vertices are dense; the picture of the floor depends on its 64 x 64 cells of 12 cm. No bounces,
+    # as probes gather the sky's light with them.
+    layers = {shading: turned(np.eye(3), shading=shading, bounces=0) for shading in ("pixel", "vertex")}
     ball = layers["pixel"]["segmentation"][..., 0] == 1
     for name, limit in (("direct", 0.01), ("albedo", 0.0)):
         error = np.abs(layers["pixel"][name] - layers["vertex"][name])[ball]
@@ -308,10 +309,18 @@ def test_bounced_light_is_a_layer_of_the_color(scene):
 def test_bounces_change_no_direct_light(shading):
     pictures = []
     for bounces in (0, 2):
-        renderer, data = make_renderer(SCENE, 27, 48, bounces=bounces, shading=shading)
+        renderer, data = make_renderer(SCENE, 135, 240, bounces=bounces, shading=shading)
         renderer.update_scene(data, "front")
         pictures.append(renderer.layers())
-    np.testing.assert_array_equal(pictures[0]["direct"], pictures[1]["direct"])
+    without, with_bounces = (layers["direct"] for layers in pictures)
+    if shading == "vertex":
+        np.testing.assert_array_equal(without, with_bounces)
+    else:
+        # With bounces, probes gather the sky's light: between them it may be off by the eight percent at which their
+        # cells are halved, and is by far less at nearly all pixels.
+        error = np.abs(without - with_bounces).max(axis=-1) / without.max()
+        assert np.sqrt((error**2).mean()) < 0.005
+        assert error.max() < 0.08
     assert not pictures[0]["indirect"].any()
     assert pictures[1]["indirect"].max() > 0.01
 

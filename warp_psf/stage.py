@@ -165,7 +165,9 @@ def set_stage(
         functions = settings.basis_functions
         radiating, flat = bake_light(scene, casts, order, functions, str(device), progress)
         bounces = upload_bounces(scene, radiating, flat, occlusion, functions, 1, device)
-        last_gather = make_last_gather(bounces, settings.bounce_threshold, *size, surfaces.slots, device)
+        gathers_sky = settings.shading == "pixel" and not shining
+        slots = surfaces.slots
+        last_gather = make_last_gather(bounces, settings.bounce_threshold, *size, slots, gathers_sky, device)
         field_bytes["radiance"] = sum({id(b): b.field.nbytes for _, b in filter(None, radiating)}.values())
     stage = Stage(
         settings=settings,
@@ -287,10 +289,16 @@ def _shade_pixels(stage: Stage) -> None:
     lattice, lights = stage.lattice, (stage.occlusion, stage.lighting)
     choose_cuts(stage.cuts.pixels, pixels, stage.spheres, device)
     begin_lattice(lattice, pixels, stage.surfaces.extra, device)
+    # Where probes bring the environment's light, pixels start from darkness.
+    by_probes = stage.last_gather is not None and stage.last_gather.gathers_sky
+    if by_probes:
+        for received in stage.received:
+            received.zero_()
     for turn in range(1, len(STRIDES) + 1):
-        whose = (lattice.turns, turn, scene)
-        with _timed(stage, "shadow fields"):
-            shade_direct(pixels, *whose, *lights, stage.cuts.pixels, *stage.received, device)
+        if not by_probes:
+            whose = (lattice.turns, turn, scene)
+            with _timed(stage, "shadow fields"):
+                shade_direct(pixels, *whose, *lights, stage.cuts.pixels, *stage.received, device)
         _add_sharp_light(stage, turn)
         with _timed(stage, "lattice"):
             if turn < len(STRIDES):
@@ -335,7 +343,7 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
     stage.has_moved = stage.is_lit_anew = False
     with _timed(stage, "last gather"):
         seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS)
-        shown = (stage.lattice, stage.received[0], stage.bounced)
+        shown = (stage.cuts.pixels, stage.lattice, stage.received, stage.bounced)
         gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
 
 
@@ -366,8 +374,9 @@ def _make_see_through(stage: Stage) -> None:
     stage.lattice = make_lattice(1, slots, *size, device)
     stage.received, stage.bounced = make_received(slots, device), make_received(slots, device)
     stage.cuts = replace(stage.cuts, pixels=make_cuts(1, slots, not stage.spheres.is_empty, device))
-    if stage.bounces is not None:
-        stage.last_gather = make_last_gather(stage.bounces, settings.bounce_threshold, *size, slots, device)
+    if stage.bounces is not None and stage.last_gather is not None:
+        threshold, gathers_sky = settings.bounce_threshold, stage.last_gather.gathers_sky
+        stage.last_gather = make_last_gather(stage.bounces, threshold, *size, slots, gathers_sky, device)
 
 
 @contextmanager

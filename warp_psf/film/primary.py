@@ -1,9 +1,9 @@
 """Primary visibility: which surfaces each pixel sees, and with which shares.
 
-Every pixel traces its centre. Where neighbouring pixels see different surfaces, or the centre meets a see-through one,
-the pixel is traced again at eight places, its samples are grouped by surface, and each group becomes a receiver of its
-own with the group's share as its weight: edges are antialiased, what lies behind a pane is seen through it, and nothing
-is shaded twice.
+What every pixel's centre sees is drawn (`film/raster.py`), or met by a ray where it cannot be drawn. Where neighbouring
+pixels see different surfaces, or the centre meets a see-through one, rays look at eight places of the pixel, their
+hits are grouped by surface, and each group becomes a receiver of its own with the group's share as its weight: edges
+are antialiased, what lies behind a pane is seen through it, and nothing is shaded twice.
 
 The receivers of a world are numbered so that slot p < pixels is the centre of pixel p, with the share of the group
 that is like it, and EXTRA_GROUPS further slots belong to each edge pixel, in the order of the pixels.
@@ -26,7 +26,8 @@ from warp_psf.film.camera_rays import (
     tile_of,
     write_cameras,
 )
-from warp_psf.film.tracing import Hit, opacity_from_behind, surface_of, trace
+from warp_psf.film.raster import DrawnTable, Raster, draw_faces, make_raster
+from warp_psf.film.tracing import Hit, nothing_known, opacity_from_behind, sight_of_face, surface_of, trace
 from warp_psf.scene.camera import Camera
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable, make_receivers
@@ -57,6 +58,8 @@ class Surfaces:
     camera: CameraTable
     tiles: TileTable
     back: wp.array  # (entity) float32, how opaque it is from behind, as a share
+    raster: Raster
+    none_known: wp.array  # (entity) int32, -1: for rays that meet everything themselves
 
     @property
     def slots(self) -> int:
@@ -93,6 +96,8 @@ def _trace_centers(
     camera: CameraTable,
     tiles: TileTable,
     back: wp.array(dtype=wp.float32),  # (entity)
+    is_drawn: wp.array(dtype=wp.int32),  # (entity): below zero where it is not
+    drawn: DrawnTable,
     receivers: ReceiverTable,
     edge_out: wp.array2d(dtype=wp.int32),
 ):
@@ -103,7 +108,11 @@ def _trace_centers(
     tile = tile_of(tiles, pixel, camera.width)
     origin = camera_origin(camera, world, x, y)
     ray = camera_ray(camera, world, x, y)
-    sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray)
+    known = nothing_known()
+    if drawn.entity[world, pixel] >= 0:
+        face = drawn.face[world, pixel]
+        known = sight_of_face(geometry, poses, world, drawn.entity[world, pixel], face, origin, ray)
+    sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray, known, is_drawn)
     hit = surface_of(geometry, poses, world, sight, 0, origin, ray)
     store_hit(receivers, world, pixel, hit, wp.where(hit.entity >= 0, 1.0, 0.0))
     edge_out[world, pixel] = wp.where(sight.panes > 0, 1, 0)
@@ -180,6 +189,7 @@ def _trace_edges(
     edge: wp.array2d(dtype=wp.int32),
     edge_rank: wp.array2d(dtype=wp.int32),
     edge_capacity: int,
+    none_known: wp.array(dtype=wp.int32),  # (entity): below zero
     samples: int,
     receivers: ReceiverTable,
     extra_out: wp.array2d(dtype=wp.int32),
@@ -205,7 +215,7 @@ def _trace_edges(
             offset = sample_offset(sample, samples)
             origin = camera_origin(camera, world, x + offset[0], y + offset[1])
             ray = camera_ray(camera, world, x + offset[0], y + offset[1])
-            sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray)
+            sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray, nothing_known(), none_known)
             behind = float(share)
             for place in range(sight.panes):
                 behind *= 1.0 - wp.abs(sight.pane_opacity[place])
@@ -245,6 +255,7 @@ def make_surfaces(
     receivers = make_receivers((worlds, pixels + EXTRA_GROUPS * capacity), device)
     receivers.entity.fill_(-1)
     extra, edge, rank = (wp.zeros((worlds, pixels), dtype=wp.int32, device=device) for _ in range(3))
+    back = opacity_from_behind(scene)
     return Surfaces(
         receivers=receivers,
         extra=extra,
@@ -255,7 +266,9 @@ def make_surfaces(
         see_through=see_through,
         camera=make_camera_table(worlds, width, height, device),
         tiles=make_tiles(worlds, width, height, len(scene.entities), device),
-        back=opacity_from_behind(scene, device),
+        back=wp.array(back, dtype=wp.float32, device=device),
+        raster=make_raster(worlds, width, height, scene, back, device),
+        none_known=wp.full(len(scene.entities), -1, dtype=wp.int32, device=device),
     )
 
 
@@ -269,8 +282,10 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     camera, receivers, tiles = surfaces.camera, surfaces.receivers, surfaces.tiles
     dim = surfaces.edge.shape
     fill_tiles(scene, camera, tiles, device)
+    draw_faces(surfaces.raster, scene, camera, tiles, device)
     views = [scene.geometry, scene.poses, camera, tiles, surfaces.back]
-    launch(_trace_centers, dim, [*views, receivers], [surfaces.edge], device)
+    drawn = [surfaces.raster.faces.first, surfaces.raster.drawn]
+    launch(_trace_centers, dim, [*views, *drawn, receivers], [surfaces.edge], device)
     if surfaces.edge_capacity == 0:
         surfaces.extra.fill_(-1)
         return
@@ -280,5 +295,6 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     # What an earlier frame left in slots that this frame's edges do not reach.
     receivers.entity[:, dim[1] :].fill_(-1)
     samples = SAMPLES if surfaces.antialias else 1
-    inputs = [*views, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, samples, receivers]
+    inputs = [*views, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, surfaces.none_known]
+    inputs += [samples, receivers]
     launch(_trace_edges, dim, inputs, [surfaces.extra], device)

@@ -138,6 +138,46 @@ def add_pane(sight: Sight, entity: int, found: Face, opacity: float) -> Sight:
 
 
 @wp.func
+def nothing_known() -> Sight:
+    sight = Sight()
+    sight.solid_entity = -1
+    return sight
+
+
+@wp.func
+def sight_of_face(
+    geometry: GeometryTables,
+    poses: PoseTables,
+    world: int,
+    entity: int,
+    face: int,
+    origin: wp.vec3,
+    direction: wp.vec3,
+) -> Sight:
+    """What a ray meets of which it is known that it is that face."""
+    mesh = geometry[0].entity_mesh[entity]
+    corners = geometry[0].faces[geometry[0].first_face[mesh] + face]
+    start = geometry[0].first_vertex[mesh]
+    a = geometry[0].vertices[start + corners[0]]
+    b = geometry[0].vertices[start + corners[1]]
+    c = geometry[0].vertices[start + corners[2]]
+    inverse = wp.transpose(poses[0].rotation[world, entity])
+    origin_entity = inverse * (origin - poses[0].position[world, entity])
+    direction_entity = inverse * direction
+    normal = wp.cross(b - a, c - a)
+    sight = nothing_known()
+    sight.solid_entity = entity
+    sight.solid.face = face
+    sight.solid.distance = wp.dot(a - origin_entity, normal) / wp.dot(direction_entity, normal)
+    p = origin_entity + sight.solid.distance * direction_entity
+    squared = wp.dot(normal, normal)
+    u = wp.clamp(wp.dot(wp.cross(c - b, p - b), normal) / squared, 0.0, 1.0)
+    sight.solid.u = u
+    sight.solid.v = wp.clamp(wp.dot(wp.cross(a - c, p - c), normal) / squared, 0.0, 1.0 - u)
+    return sight
+
+
+@wp.func
 def trace(
     geometry: GeometryTables,
     poses: PoseTables,
@@ -148,15 +188,23 @@ def trace(
     world: int,
     origin: wp.vec3,
     direction: wp.vec3,
+    known: Sight,
+    is_known: wp.array(dtype=wp.int32),  # (entity)
 ) -> Sight:
-    """What a camera ray of unit depth meets. `back`: how opaque an entity is from behind, as a share; 0: not at all."""
-    sight = Sight()
-    sight.solid_entity = -1
+    """What a camera ray of unit depth meets. `back`: how opaque an entity is from behind, as a share; 0: not at all.
+
+    known: what it meets of the entities for which `is_known` is not below zero; see `nothing_known`.
+    """
+    sight = known
     near = camera.near[world]
     nearest = camera.far[world]
+    if sight.solid_entity >= 0:
+        nearest = sight.solid.distance
     length_squared = wp.dot(direction, direction)
     for place in range(tiles.count[world, tile]):
         entity = tiles.entity[world, tile, place]
+        if is_known[entity] >= 0:
+            continue
         position = poses[0].position[world, entity]
         rotation = poses[0].rotation[world, entity]
         to_center = position + rotation * geometry[0].center[entity] - origin
@@ -246,7 +294,7 @@ def surface_of(
     return hit
 
 
-def opacity_from_behind(scene: Scene, device: wp.Device) -> wp.array:
+def opacity_from_behind(scene: Scene) -> np.ndarray:
     """How opaque each entity is from behind, as a share of its opacity from the front, float32 (entity)."""
     shapes = [scene.meshes[entity.mesh] for entity in scene.entities]
     back = np.zeros(len(shapes), np.float32)
@@ -256,7 +304,7 @@ def opacity_from_behind(scene: Scene, device: wp.Device) -> wp.array:
     for _, entity in area_light_entities(scene):
         if back[entity] > 0.0:
             back[entity] = 1.0
-    return wp.array(back, dtype=wp.float32, device=device)
+    return back
 
 
 def any_seen_from_behind(scene: Scene, poses: Poses, camera: Camera) -> bool:

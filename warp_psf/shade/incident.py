@@ -20,6 +20,7 @@ from warp_psf.shade.between import overlap
 from warp_psf.shade.bounce import make_bounce
 from warp_psf.shade.patches import PatchTables, slab_from_world, slab_origin
 from warp_psf.shade.relations import RelationTable, hides_body, hides_face
+from warp_psf.shade.spheres import CutTables
 
 
 def wide_order(order: int) -> int:
@@ -167,6 +168,35 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
             weighted = weigh_channel(incident, channel, lighting[0].weights[0])
             light_out[probe, channel] = to_sh(world, own, weighted, o, lighting, wide_rows)
 
+    @wp.kernel(enable_backward=False, module="unique")
+    def gather_environment(
+        first: int,
+        start: int,
+        probe_slot: wp.array(dtype=wp.int32),  # (probe): world * slots + slot
+        receivers: ReceiverTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
+        patches: PatchTables,
+        cuts: CutTables,
+        wide_rows: wp.array(dtype=half_values),
+        sky_out: wp.array2d(dtype=wide),  # (probe, channel)
+    ):
+        _world, item = wp.tid()
+        probe = start + first + item
+        slots = receivers.entity.shape[1]
+        world = probe_slot[probe] / slots
+        slot = probe_slot[probe] % slots
+        own = receivers.entity[world, slot]
+        # On a round body the pixels around a probe have other horizons: there bodies below it hide their part, too.
+        n = wp.where(patches[0].first_face[own] >= 0, receivers.normal[world, slot], wp.vec3())
+        p = receivers.position[world, slot]
+        visible, _before = kit.visibility_at(world, slot, own, -1, wp.vec3(), p, n, geometry, poses, o, cuts)
+        for channel in range(3):
+            weighted = wp.cw_mul(lighting[0].environment[world, channel], visible)
+            sky_out[probe, channel] = to_sh(world, own, weighted, o, lighting, wide_rows)
+
     @wp.func
     def response_of(world: int, surface: Surface, poses: PoseTables, lighting: LightingTables) -> wide:
         """What incident light is to be multiplied with to give irradiance."""
@@ -183,6 +213,7 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
         to_sh=to_sh,
         response_of=response_of,
         gather_incident=gather_incident,
+        gather_environment=gather_environment,
     )
 
 

@@ -1,4 +1,4 @@
-"""The last gather: light from the bodies around, at sparse pixels, for all pixels.
+"""The last gather: light from the bodies around, and from the sky past them, at sparse pixels, for all pixels.
 
 The light that arrives at a point varies slowly from point to point, while what a surface makes of it varies with its
 normal. So it is gathered at probes, pixels a few apart, as SH vectors of incident radiance past what stands between,
@@ -17,7 +17,7 @@ from warp_psf.field.radiance import sum_fields
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.bounce import BounceState
-from warp_psf.shade.direct import DirectState
+from warp_psf.shade.direct import DirectState, shade_direct
 from warp_psf.shade.incident import wide_rows
 from warp_psf.shade.lattice import INTERPOLATED, Lattice, interpolate_lattice
 from warp_psf.shade.occluders import OcclusionState
@@ -25,6 +25,11 @@ from warp_psf.shade.probes import LEAST_WEIGHT, SPACINGS, ProbeTable, make_probe
 
 # A lobe that reflects no more than this mirrors the bodies around too faintly to be seen; it takes their mean.
 LEAST_SHINE = 0.03
+# Beside a contact the sky's light has a kink that no probe would find. So receivers on edges look at the sky
+# themselves, and where that differs from what probes say by more than this share, those so many pixels around on the
+# same body do.
+KINKED, KINK_REACH = 0.1, 2
+BY_PROBES, ON_EDGE, BESIDE_KINK = 0, 1, 2
 # Room for probes at first, as a share of the pixels; it grows when a picture needs more.
 FIRST_ROOM = 1 / 8
 
@@ -48,12 +53,15 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
         o: OcclusionTables,
         lighting: LightingTables,
         wide_rows: wp.array(dtype=half_values),
-        light: wp.array2d(dtype=wide),  # (probe, channel)
+        light: wp.array2d(dtype=wide),  # (probe, channel): bounced
+        sky: wp.array2d(dtype=wide),  # (probe, channel): of the environment, or empty
         own_first: wp.array(dtype=wp.int32),  # (entity): first of `own_light`, -1 for convex bodies
         own_light: wp.array2d(dtype=wp.vec3),  # (world, vertex): irradiance from the body itself
         turns: wp.array2d(dtype=wp.int32),  # (world, slot)
         diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance
         glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot): radiance through the normalised Phong lobe
+        sky_diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot): likewise of the sky, where there is one
+        sky_glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot)
     ):
         world, slot = wp.tid()
         slot += first
@@ -72,28 +80,34 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
             weighted = wp.cw_mul(wp.cw_mul(lobe, transfer), lighting[0].weights[0])
             shine = kit.to_sh(world, entity, weighted, o, lighting, wide_rows)
-        diffuse = wp.vec3()
-        glossy = wp.vec3()
-        probe = probes.probe[world, slot]
-        if probe >= 0:
-            diffuse = irradiance_of(light, probe, response)
-            if is_glossy:
-                glossy = irradiance_of(light, probe, shine)
+        corners = wp.vec4i(-1, -1, -1, -1)
+        weights = wp.vec4()
+        total = float(1.0)
+        if probes.probe[world, slot] >= 0:
+            corners[0] = probes.probe[world, slot]
+            weights[0] = 1.0
         else:
             total = float(0.0)
             spacing = kit.finest_spacing(world, pixel, probes)
-            corners = wp.vec4i()
-            weights = wp.vec4()
             while total < wp.static(LEAST_WEIGHT) and spacing <= wp.static(SPACINGS[0]):
                 corners, weights = cell_of(world, slot, pixel, spacing, probes, receivers)
                 total = weights[0] + weights[1] + weights[2] + weights[3]
                 spacing = 2 * spacing
-            for place in range(4):
-                if corners[place] >= 0:
-                    share = weights[place] / total
-                    diffuse += share * irradiance_of(light, corners[place], response)
-                    if is_glossy:
-                        glossy += share * irradiance_of(light, corners[place], shine)
+        by_probes = sky.shape[0] > 0
+        diffuse = wp.vec3()
+        glossy = wp.vec3()
+        from_sky = wp.vec3()
+        glossy_from_sky = wp.vec3()
+        for place in range(4):
+            if corners[place] >= 0:
+                share = weights[place] / total
+                diffuse += share * irradiance_of(light, corners[place], response)
+                if by_probes:
+                    from_sky += share * irradiance_of(sky, corners[place], response)
+                if is_glossy:
+                    glossy += share * irradiance_of(light, corners[place], shine)
+                    if by_probes:
+                        glossy_from_sky += share * irradiance_of(sky, corners[place], shine)
         if own_first[entity] >= 0:
             corner = surface.corners + wp.vec3i(own_first[entity])
             u = surface.uv[0]
@@ -105,8 +119,12 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             glossy += from_itself / wp.pi
         if not is_glossy:
             glossy = diffuse / wp.pi
+            glossy_from_sky = from_sky / wp.pi
         diffuse_out[world, slot] = wp.max(diffuse, wp.vec3())
         glossy_out[world, slot] = wp.max(glossy, wp.vec3())
+        if by_probes:
+            sky_diffuse_out[world, slot] = wp.max(from_sky, wp.vec3())
+            sky_glossy_out[world, slot] = wp.max(glossy_from_sky, wp.vec3())
 
     return SimpleNamespace(**vars(kit), receive_incident=receive_incident)
 
@@ -117,14 +135,17 @@ def _find_pixels(
     extra: wp.array2d(dtype=wp.int32),  # (world, pixel): its first extra slot, -1 for none
     extra_count: int,
     pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
+    looks_up: wp.array2d(dtype=wp.int32),  # (world, slot): see `LastGather`
 ):
     world, pixel = wp.tid()
     pixel += first
     pixel_of[world, pixel] = pixel
     start = extra[world, pixel]
+    looks_up[world, pixel] = wp.where(start >= 0, wp.static(ON_EDGE), wp.static(BY_PROBES))
     if start >= 0:
         for place in range(extra_count):
             pixel_of[world, start + place] = pixel
+            looks_up[world, start + place] = wp.static(ON_EDGE)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -156,11 +177,66 @@ def _number_probes(
         probes.slot[number] = world * chosen.shape[1] + slot
 
 
+@wp.kernel(enable_backward=False, module="unique")
+def _settle_edges(
+    first: int,
+    receivers: ReceiverTable,
+    pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
+    width: int,
+    seen: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance that receivers on edges found themselves
+    seen_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    looks_up: wp.array2d(dtype=wp.int32),  # (world, slot)
+    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot): from probes; receivers on edges get their own
+    glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+):
+    world, slot = wp.tid()
+    slot += first
+    if looks_up[world, slot] != wp.static(ON_EDGE) or receivers.entity[world, slot] < 0:
+        return
+    own = seen[world, slot]
+    difference = wp.max(wp.abs(own - diffuse[world, slot]))
+    diffuse[world, slot] = own
+    glossy[world, slot] = seen_glossy[world, slot]
+    if difference <= wp.static(KINKED) * wp.max(own):
+        return
+    pixel = pixel_of[world, slot]
+    x = pixel % width
+    y = pixel / width
+    pixels = pixel_of.shape[1]
+    for row in range(wp.max(y - wp.static(KINK_REACH), 0), y + wp.static(KINK_REACH + 1)):
+        for column in range(wp.max(x - wp.static(KINK_REACH), 0), wp.min(x + wp.static(KINK_REACH + 1), width)):
+            near = row * width + column
+            if near < pixels:
+                if pixel_of[world, near] == near and looks_up[world, near] == wp.static(BY_PROBES):
+                    if receivers.entity[world, near] == receivers.entity[world, slot]:
+                        looks_up[world, near] = wp.static(BESIDE_KINK)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _add_light(
+    first: int,
+    receivers: ReceiverTable,
+    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot), added to
+    glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot), added to
+):
+    world, slot = wp.tid()
+    slot += first
+    if receivers.entity[world, slot] >= 0:
+        diffuse_out[world, slot] = diffuse_out[world, slot] + diffuse[world, slot]
+        glossy_out[world, slot] = glossy_out[world, slot] + glossy[world, slot]
+
+
 @dataclass
 class LastGather:
-    """The probes of a picture. Their number differs from frame to frame; `light` grows with it.
+    """The probes of a picture. Their number differs from frame to frame; `light` and `sky` grow with it.
 
-    light: SH vectors of incident radiance (probe, channel), about the axes that `make_incident` says.
+    light: SH vectors of incident radiance (probe, channel), about the axes that `make_incident` says, of bounced light.
+    sky: likewise, of what the bodies leave of the environment; empty where pixels receive that themselves.
+    sky_received: what the pixels' receivers receive of that: irradiance and Phong radiance, vec3 (world, slot).
+    looks_up: which receivers look at the sky themselves, and why: BY_PROBES, ON_EDGE or BESIDE_KINK (world, slot).
+    own_sky: what those on edges receive of it by themselves.
     """
 
     bounces: BounceState
@@ -169,17 +245,33 @@ class LastGather:
     chosen: wp.array
     rank: wp.array
     pixel_of: wp.array
+    looks_up: wp.array
     wide_rows: wp.array
     light: wp.array
+    sky: wp.array
+    sky_received: tuple[wp.array, wp.array]
+    own_sky: tuple[wp.array, wp.array]
     count: int = 0
+
+    @property
+    def gathers_sky(self) -> bool:
+        """Whether probes bring the environment's light as well."""
+        return self.sky.shape[0] > 0
 
 
 def make_last_gather(
-    bounces: BounceState, threshold: float, width: int, height: int, slots: int, device: wp.Device
+    bounces: BounceState,
+    threshold: float,
+    width: int,
+    height: int,
+    slots: int,
+    gathers_sky: bool,
+    device: wp.Device,
 ) -> LastGather:
     """Room for the probes of a picture of width x height pixels with `slots` receivers per world.
 
-    threshold: bodies that take up a smaller share of a probe's view than this are skipped.
+    threshold: bodies that take up a smaller share of a probe's view than this send it no light.
+    gathers_sky: whether probes are to bring the environment's light as well.
     """
     worlds = bounces.turns.shape[0]
     table = ProbeTable()
@@ -187,11 +279,16 @@ def make_last_gather(
     table.probe = wp.zeros((worlds, slots), dtype=wp.int32, device=device)
     table.slot = wp.zeros(worlds * slots, dtype=wp.int32, device=device)
     table.refined = wp.zeros((worlds, width * height), dtype=wp.int32, device=device)
-    chosen, rank, pixel_of = (wp.zeros((worlds, slots), dtype=wp.int32, device=device) for _ in range(3))
+    chosen, rank, pixel_of, looks_up = (wp.zeros((worlds, slots), dtype=wp.int32, device=device) for _ in range(4))
     kit = make_last_bounce(bounces.order, bounces.functions)
-    light = wp.zeros((int(FIRST_ROOM * worlds * width * height) + 1, 3), dtype=kit.wide, device=device)
+    room = int(FIRST_ROOM * worlds * width * height) + 1
+    light, sky = (wp.zeros((count, 3), dtype=kit.wide, device=device) for count in (room, room * gathers_sky))
+    shape = (worlds, slots * gathers_sky)
+    received, own = (
+        (wp.zeros(shape, dtype=wp.vec3, device=device), wp.zeros(shape, dtype=wp.vec3, device=device)) for _ in range(2)
+    )
     rows = wide_rows(bounces.order, device)
-    return LastGather(bounces, threshold, table, chosen, rank, pixel_of, rows, light)
+    return LastGather(bounces, threshold, table, chosen, rank, pixel_of, looks_up, rows, light, sky, received, own)
 
 
 def gather_last_bounce(
@@ -202,46 +299,78 @@ def gather_last_bounce(
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
+    cuts: wp.array,
     lattice: Lattice,
-    direct: wp.array,
+    direct: tuple[wp.array, wp.array],
     bounced: tuple[wp.array, wp.array],
     device: wp.Device,
 ) -> None:
     """Fills `bounced`, irradiance and Phong radiance of the pixels' receivers, vec3 (world, slot).
 
     extra: int32 (world, pixel), an edge pixel's first extra slot, else -1; extra_count: how many it has.
-    lattice: where direct light was interpolated between pixels, the bounced light is, too. direct: its irradiance, vec3
-    (world, slot).
+    cuts: of the pixels' receivers, see `choose_cuts`. lattice: where direct light was interpolated between pixels, the
+    bounced light is, too. direct: direct light likewise, to which the sky's is added where probes gather that.
     """
     state, table, kit = gather.bounces, gather.table, make_last_bounce(gather.bounces.order, gather.bounces.functions)
-    worlds = extra.shape[0]
+    worlds, around = extra.shape[0], (pixels, scene, occlusion, lighting, cuts)
     sum_fields(state.summed, state.fields, state.weights_rgb, device)
     sum_fields(state.gloss.summed, state.fields, state.gloss.along, device)
     for array, value in ((table.probe, -1), (table.refined, 0), (gather.pixel_of, -1), (gather.chosen, 0)):
         array.fill_(value)
     gather.count = 0
-    launch(_find_pixels, extra.shape, [extra, extra_count], [gather.pixel_of], device)
+    launch(_find_pixels, extra.shape, [extra, extra_count], [gather.pixel_of, gather.looks_up], device)
     seen = [pixels, scene.geometry, scene.poses, lighting.tables]
     cells = [-(-table.width // spacing) * -(-table.height // spacing) for spacing in SPACINGS]
     launch(_choose_lattice, (worlds, cells[0]), [SPACINGS[0], table, pixels], [gather.chosen], device)
-    _gather_chosen(gather, extra.shape[1], pixels, scene, occlusion, lighting, device)
+    _gather_chosen(gather, extra.shape[1], *around, device)
     for turn in range(len(SPACINGS) - 1):
-        inputs = [turn, table, *seen, gather.light, direct]
+        inputs = [turn, table, *seen, gather.light, gather.sky, direct[0]]
         launch(kit.refine_cells, (worlds, cells[turn]), inputs, [gather.chosen], device)
-        _gather_chosen(gather, extra.shape[1], pixels, scene, occlusion, lighting, device)
+        _gather_chosen(gather, extra.shape[1], *around, device)
     launch(
         kit.choose_unserved,
         gather.chosen.shape,
-        [table, pixels, gather.pixel_of, lattice.turns],
+        [table, pixels, gather.pixel_of, gather.gathers_sky, lattice.turns],
         [gather.chosen],
         device,
     )
-    _gather_chosen(gather, gather.chosen.shape[1], pixels, scene, occlusion, lighting, device)
+    _gather_chosen(gather, gather.chosen.shape[1], *around, device)
 
-    inputs = [table, pixels, gather.pixel_of, scene.geometry, scene.poses, occlusion.tables, lighting.tables]
-    inputs += [gather.wide_rows, gather.light, state.own_first, state.own_light, lattice.turns]
-    launch(kit.receive_incident, gather.chosen.shape, inputs, list(bounced), device)
+    inputs = [table, pixels, gather.pixel_of, scene.geometry, scene.poses]
+    inputs += [
+        occlusion.tables,
+        lighting.tables,
+        gather.wide_rows,
+        gather.light,
+        gather.sky,
+        state.own_first,
+        state.own_light,
+        lattice.turns,
+    ]
+    launch(kit.receive_incident, gather.chosen.shape, inputs, [*bounced, *gather.sky_received], device)
     interpolate_lattice(lattice, pixels, *bounced, device)
+    if gather.gathers_sky:
+        _finish_sky(gather, pixels, scene, occlusion, lighting, cuts, lattice, device)
+        launch(_add_light, gather.chosen.shape, [pixels, *gather.sky_received], list(direct), device)
+
+
+def _finish_sky(
+    gather: LastGather,
+    pixels: ReceiverTable,
+    scene: DeviceScene,
+    occlusion: OcclusionState,
+    lighting: DirectState,
+    cuts: wp.array,
+    lattice: Lattice,
+    device: wp.Device,
+) -> None:
+    """Brings the sky's light to where probes have not: receivers on edges, beside kinks, and in interpolated cells."""
+    turns, lights = gather.looks_up, (scene, occlusion, lighting, cuts)
+    shade_direct(pixels, turns, ON_EDGE, *lights, *gather.own_sky, device)
+    inputs = [pixels, gather.pixel_of, lattice.width, *gather.own_sky]
+    launch(_settle_edges, turns.shape, inputs, [turns, *gather.sky_received], device)
+    interpolate_lattice(lattice, pixels, *gather.sky_received, device)
+    shade_direct(pixels, turns, BESIDE_KINK, *lights, *gather.sky_received, device)
 
 
 def _gather_chosen(
@@ -251,6 +380,7 @@ def _gather_chosen(
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
+    cuts: wp.array,
     device: wp.Device,
 ) -> None:
     """Makes probes of those of the first `slots` slots that are chosen, and gathers their light."""
@@ -264,12 +394,14 @@ def _gather_chosen(
     dim = (gather.chosen.shape[0], slots)
     launch(_number_probes, dim, [gather.chosen, gather.rank, gather.count, gather.table], [], device)
     if gather.count + fresh > gather.light.shape[0]:
-        larger = wp.zeros((2 * (gather.count + fresh), 3), dtype=kit.wide, device=device)
-        wp.copy(larger, gather.light, count=gather.light.size)
-        gather.light = larger
+        gather.light = _enlarge(gather.light, 2 * (gather.count + fresh))
+        if gather.gathers_sky:
+            gather.sky = _enlarge(gather.sky, 2 * (gather.count + fresh))
     inputs = [gather.count, gather.table.slot, pixels, scene.geometry, scene.poses, occlusion.tables, lighting.tables]
+    inputs.append(state.patches.tables)
+    if gather.gathers_sky:
+        launch(kit.gather_environment, (1, fresh), [*inputs, cuts, gather.wide_rows], [gather.sky], device)
     inputs += [
-        state.patches.tables,
         state.relations,
         state.fields,
         state.bodies,
@@ -281,3 +413,10 @@ def _gather_chosen(
     ]
     launch(kit.gather_incident, (1, fresh), [*inputs, gather.wide_rows, gather.threshold], [gather.light], device)
     gather.count += fresh
+
+
+def _enlarge(light: wp.array, count: int) -> wp.array:
+    """The vectors of the probes so far, with room for `count` probes."""
+    larger = wp.zeros((count, 3), dtype=light.dtype, device=light.device)
+    wp.copy(larger, light, count=light.size)
+    return larger

@@ -22,8 +22,9 @@ BENT_LIGHT = wp.constant(0.04)
 UNLIKE_LIGHT = wp.constant(0.2)
 # ... and when the normals in it lie within acos(0.93), 22 degrees.
 SMOOTH_NORMAL = wp.constant(0.93)
-# A receiver's turn: 0 waits, 1, 2, 3 are the strides' turns, and INTERPOLATED needs none.
-INTERPOLATED = 4
+# A receiver's turn: 0 waits, 1, 2, 3 are the strides' turns, and INTERPOLATED needs none. AWAKE is one whose light from
+# probes is not to be interpolated, whatever else was.
+INTERPOLATED, AWAKE = 4, 5
 
 
 @dataclass(frozen=True)

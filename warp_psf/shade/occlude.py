@@ -42,7 +42,10 @@ def make_occlude(order: int) -> SimpleNamespace:
         placed: Placed,
         o: OcclusionTables,
     ) -> float:
-        """How far an entity can take light from a receiver at p with normal n: 0 not at all, its opacity fully."""
+        """How far an entity can take light from a receiver at p with normal n: 0 not at all, its opacity fully.
+
+        Without a normal, a zero vector, there is no horizon.
+        """
         opacity = o[0].occluders.opacity[entity]
         if entity == own or opacity <= 0.0:
             return 0.0
@@ -55,7 +58,8 @@ def make_occlude(order: int) -> SimpleNamespace:
             half = o[0].occluders.slab_half[entity]
             n_slab = wp.transpose(placed.rotation * o[0].occluders.slab_rotation[entity]) * n
             rise = wp.abs(n_slab[0]) * half[0] + wp.abs(n_slab[1]) * half[1] + wp.abs(n_slab[2]) * half[2]
-            return size * wp.where(height + rise > wp.static(SLAB_HORIZON) * placed.radius, 1.0, 0.0)
+            above = height + rise > wp.static(SLAB_HORIZON) * placed.radius or wp.length_sq(n) == 0.0
+            return size * wp.where(above, 1.0, 0.0)
         return size * horizon_fade(height, placed.radius)
 
     @wp.func

@@ -11,7 +11,7 @@ import warp as wp
 from warp_psf.scene.geometry import GeometryTables, PoseTables
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.shade.incident import make_incident
-from warp_psf.shade.lattice import INTERPOLATED
+from warp_psf.shade.lattice import AWAKE, INTERPOLATED, STRIDES
 
 # Spacings of the probes, pixels. A cell of all but the last is halved where its probes are not close enough.
 SPACINGS = (16, 8, 4, 2)
@@ -19,6 +19,8 @@ SPACINGS = (16, 8, 4, 2)
 # or by no more than this share of all light there.
 SMOOTH_INDIRECT = 0.15
 SMOOTH_ALL = 0.02
+# ... and when what it receives of the sky differs by no more than this share of all light there.
+SMOOTH_SKY = 0.08
 # A pixel takes over a probe on the same body whose normal is near its own (cosines: full at the first, not at all at
 # the second), and which lies near its tangent plane (sines likewise): not one from the other side of a handle.
 ALIGNED, NOT_ALIGNED = 0.7, 0.2
@@ -125,6 +127,7 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
         probes: ProbeTable,
         receivers: ReceiverTable,
         light: wp.array2d(dtype=wide),
+        sky: wp.array2d(dtype=wide),
     ) -> bool:
         """Whether the probes of a pixel's cell serve it with at least the weight `least`, and agree."""
         corners, weights = cell_of(world, pixel, pixel, spacing, probes, receivers)
@@ -132,13 +135,22 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
             return False
         lowest = wp.vec3(1.0e30, 1.0e30, 1.0e30)
         highest = wp.vec3()
+        lowest_sky = wp.vec3(1.0e30, 1.0e30, 1.0e30)
+        highest_sky = wp.vec3()
         for corner in range(4):
             if corners[corner] >= 0:
                 received = wp.max(irradiance_of(light, corners[corner], response), wp.vec3())
                 lowest = wp.min(lowest, received)
                 highest = wp.max(highest, received)
-        allowed = wp.max(wp.static(SMOOTH_INDIRECT) * wp.max(highest), wp.static(SMOOTH_ALL) * wp.max(highest + direct))
-        return wp.max(highest - lowest) <= allowed
+                if sky.shape[0] > 0:
+                    received = wp.max(irradiance_of(sky, corners[corner], response), wp.vec3())
+                    lowest_sky = wp.min(lowest_sky, received)
+                    highest_sky = wp.max(highest_sky, received)
+        everything = wp.max(highest + highest_sky + direct)
+        allowed = wp.max(wp.static(SMOOTH_INDIRECT) * wp.max(highest), wp.static(SMOOTH_ALL) * everything)
+        if wp.max(highest - lowest) > allowed:
+            return False
+        return sky.shape[0] == 0 or wp.max(highest_sky - lowest_sky) <= wp.static(SMOOTH_SKY) * everything
 
     @wp.kernel(enable_backward=False, module="unique")
     def refine_cells(
@@ -149,8 +161,9 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
         geometry: GeometryTables,
         poses: PoseTables,
         lighting: LightingTables,
-        light: wp.array2d(dtype=wide),  # (probe, channel)
-        direct: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance
+        light: wp.array2d(dtype=wide),  # (probe, channel): bounced
+        sky: wp.array2d(dtype=wide),  # (probe, channel): of the environment, empty where pixels receive that themselves
+        direct: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance without the sky's
         chosen_out: wp.array2d(dtype=wp.int32),  # (world, slot), set to 1
     ):
         world, cell = wp.tid()
@@ -178,7 +191,7 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
                         turn < wp.static(len(SPACINGS) - 2), wp.static(HALF_SERVED), wp.static(LEAST_WEIGHT)
                     )
                     smooth = has_smooth_cell(
-                        world, pixel, spacing, response, least, direct[world, pixel], probes, receivers, light
+                        world, pixel, spacing, response, least, direct[world, pixel], probes, receivers, light, sky
                     )
         if not smooth:
             corner = above * probes.width + left
@@ -198,13 +211,19 @@ def make_probes(order: int, functions: int) -> SimpleNamespace:
         probes: ProbeTable,
         receivers: ReceiverTable,
         pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot): -1 where a slot is empty
+        is_sky: bool,
         turns: wp.array2d(dtype=wp.int32),  # (world, slot)
         chosen_out: wp.array2d(dtype=wp.int32),  # (world, slot)
     ):
         world, slot = wp.tid()
         slot += first
         if turns[world, slot] == wp.static(INTERPOLATED):
-            return
+            if not is_sky or receivers.entity[world, slot] < 0:
+                return
+            if finest_spacing(world, slot, probes) >= wp.static(STRIDES[0]):
+                return
+            # What pixels receive of the sky bends here, although their other direct light does not.
+            turns[world, slot] = wp.static(AWAKE)
         if receivers.entity[world, slot] >= 0 and pixel_of[world, slot] >= 0 and probes.probe[world, slot] < 0:
             if not is_served(world, slot, pixel_of[world, slot], probes, receivers):
                 chosen_out[world, slot] = 1
