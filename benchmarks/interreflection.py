@@ -26,7 +26,7 @@ from tests.oracles_bounce import WorldMeshes, traced_bounces, world_meshes
 ORDER = 4
 BOUNCES = 3
 # Simulated seconds at which each scene is compared: bodies in the air, lying and standing.
-MOMENTS = {"bunny": 0.0, "bowling": 2.0, "falling": 2.5, "room": 1.0}
+MOMENTS = {"bunny": 0.0, "bowling": 2.0, "falling": 2.5, "room": 1.0, "statues": 1.0, "teapots": 1.0}
 # Metres that the body between the walls is high.
 BUNNY_HEIGHT = 1.0
 # Neighbouring pixels on one smooth surface: the cosine between their normals is at least this.

@@ -1,11 +1,11 @@
 """Moving frames against Mitsuba 3 and its denoiser: `python -m benchmarks.vs_mitsuba bowling falling`.
 
-Scenes in their own environment (of order 4) and area lights, every surface Lambert, direct light and three bounces, on
-all cores. For a frame in which the bodies have moved, in one process:
+Scenes in their own environment (of order 4) and area lights, every surface Lambert, direct light and three bounces,
+antialiased, on all cores. For a frame in which the bodies have moved, in one process:
 
 - ours: milliseconds to take the poses over and render, and the RMSE against Mitsuba with `--reference` samples, scaled
   to a mean luminance of 0.5 and clamped to [0, 1]; over all that is seen, and over the foreground (all but floors,
-  walls and other flat bodies).
+  walls and other flat bodies); and the mean FLIP (Andersson 2020) of the pictures as they are shown.
 - Mitsuba, LLVM, multijitter: the same at several samples per pixel, moving the vertices included; and the time that it
   needs to reach our error, between these. Its noise falls with the root of its samples; where our error lies beyond
   what was rendered, it is extrapolated so.
@@ -48,6 +48,8 @@ SAMPLES, DENOISED = (1, 4, 9, 16, 36, 64), (2, 4)
 BASES = ("sh", "haar")
 REPEATS = 5
 VARIANT = "llvm_ad_rgb"
+# More than one: edges are antialiased, as Mitsuba's are.
+EDGE_SAMPLES = 4
 
 
 def main() -> None:
@@ -73,10 +75,12 @@ def main() -> None:
 def measure(mi: Any, case: Case, reference_samples: int) -> list[dict]:
     """All rows of a scene, printed as they are found."""
     print(f"\n{case.name}, {case.size[0]}x{case.size[1]}")
-    print(f"  {'':<22}{'ms':>9}{'RMSE':>9}{'foreground':>12}{'flicker':>9}")
+    print(f"  {'':<22}{'ms':>9}{'RMSE':>9}{'foreground':>12}{'FLIP':>8}{'flicker':>9}")
+    case.model.vis.quality.offsamples = EDGE_SAMPLES
     before, after = moving_states(case)
     ours = {basis: render_ours(case, before, after, basis) for basis in BASES}
-    _, layers, milliseconds = ours[BASES[0]]
+    _, layers, milliseconds = ours[BASES[-1]]
+    flip: Any = importlib.import_module("flip_evaluator")
     scene = MitsubaScene(mi, case, layers["pose"])
     scene.move(after)
     reference = scene.render(reference_samples, seed=9999, reference=True)
@@ -86,6 +90,10 @@ def measure(mi: Any, case: Case, reference_samples: int) -> list[dict]:
         difference = np.clip(scale * picture, 0, 1) - np.clip(scale * other, 0, 1)
         return float(np.sqrt(np.mean(difference[chosen] ** 2)))
 
+    def difference_seen(picture: np.ndarray) -> float:
+        shown = [psf.to_display(scale * each, view="srgb").astype(np.float32) / 255 for each in (reference, picture)]
+        return float(flip.evaluate(*shown, "LDR")[1])
+
     def row(name: str, took: float, picture: np.ndarray, again: np.ndarray) -> dict:
         found = {
             "scene": case.name,
@@ -93,10 +101,12 @@ def measure(mi: Any, case: Case, reference_samples: int) -> list[dict]:
             "milliseconds": took,
             "rmse": error(picture, reference, layers["seen"]),
             "foreground": error(picture, reference, layers["foreground"]),
+            "flip": difference_seen(picture),
             "flicker": error(picture, again, layers["seen"]),
         }
         print(
-            f"  {name:<22}{took:>9.0f}{found['rmse']:>9.4f}{found['foreground']:>12.4f}{found['flicker']:>9.4f}",
+            f"  {name:<22}{took:>9.0f}{found['rmse']:>9.4f}{found['foreground']:>12.4f}{found['flip']:>8.4f}"
+            f"{found['flicker']:>9.4f}",
             flush=True,
         )
         return found
@@ -117,7 +127,7 @@ def measure(mi: Any, case: Case, reference_samples: int) -> list[dict]:
             print(f"  Mitsuba needs {needed:,.0f} ms for the {share} of {found['renderer']}: {times:.1f} times as long")
     fastest = milliseconds_of_mujoco(case, before, after)
     if fastest is not None:
-        own[0]["mujoco's milliseconds"] = fastest
+        own[-1]["mujoco's milliseconds"] = fastest
         print(f"  mujoco.Renderer takes {fastest:.0f} ms: ours are {milliseconds / fastest:.1f} times that")
     return own + rows
 
@@ -243,7 +253,7 @@ def milliseconds_of_mujoco(case: Case, before: mujoco.MjData, after: mujoco.MjDa
     """Of mujoco.Renderer with shadows; None where OpenGL cannot be had."""
     try:
         renderer = mujoco.Renderer(case.model, case.size[1], case.size[0])
-    except Exception as error:
+    except Exception as error:  # every back end fails in its own way
         print(f"  mujoco.Renderer: {error}")
         return None
     taken = []

@@ -27,7 +27,7 @@ def sky() -> psf.Environment:
 
 @pytest.fixture(scope="module")
 def scene():
-    renderer, data = make_renderer(SCENE, HEIGHT, WIDTH, environment=sky())
+    renderer, data = make_renderer(SCENE, HEIGHT, WIDTH, environment=sky(), bounces=0)
     renderer.update_scene(data, "front")
     renderer.layers()
     return renderer
@@ -130,7 +130,7 @@ def test_linear_light_is_interpolated_exactly(scene):
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 7), (5, 1), (3, 4), (5, 6)])
 def test_pictures_smaller_than_a_cell(height, width):
-    renderer, data = make_renderer(SCENE, height, width, environment=sky())
+    renderer, data = make_renderer(SCENE, height, width, environment=sky(), bounces=0)
     renderer.update_scene(data, "front")
     layers = renderer.layers()
     entity = renderer._stage.surfaces.receivers.entity.numpy()[0] >= 0

@@ -260,8 +260,10 @@ def test_a_draft_stands_in_for_bounced_light_with_its_mean(model, data):
     draft = scene.draft(data, 0, eye, Look(), 24000)
     dark = scene.picture(data, 0, eye, Look(bounces=False), 24000)
     scene.close()
-    # Direct light is the same, and the mean of all light that reaches the eye as well, to rounding of the sums.
-    assert np.allclose(draft["direct"], large["direct"], atol=1e-5)
+    # Direct light is the same, but for what probes, which come with bounces, miss of the sky between them. The mean of
+    # bounced light is the same, to rounding of the sums.
+    difference = draft["direct"] - large["direct"]
+    assert np.sqrt((difference**2).mean()) < 0.01 * large["direct"].max()
     assert draft["indirect"].mean() == pytest.approx(large["indirect"].mean(), rel=1e-3)
     assert dark["color"].mean() < draft["color"].mean()
 

@@ -342,9 +342,18 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         _light_proxies(stage, bounces)
     stage.has_moved = stage.is_lit_anew = False
     with _timed(stage, "last gather"):
-        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS)
+        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS, _pixel_size(stage))
         shown = (stage.cuts.pixels, stage.lattice, stage.received, stage.bounced)
         gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
+
+
+def _pixel_size(stage: Stage) -> wp.vec2:
+    """How wide a pixel is at depth 0, metres, and how much wider it gets per metre."""
+    if stage.seen is None:
+        return wp.vec2(0.0, 0.0)
+    view, settings = stage.seen[0], stage.settings
+    size = 2.0 * view.half_sizes(settings.width, settings.height)[0] / settings.width
+    return wp.vec2(size, 0.0) if view.orthographic else wp.vec2(0.0, size)
 
 
 def _light_proxies(stage: Stage, bounces: BounceState) -> None:

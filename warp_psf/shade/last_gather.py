@@ -25,11 +25,12 @@ from warp_psf.shade.probes import LEAST_WEIGHT, SPACINGS, ProbeTable, make_probe
 
 # A lobe that reflects no more than this mirrors the bodies around too faintly to be seen; it takes their mean.
 LEAST_SHINE = 0.03
-# Beside a contact the sky's light has a kink that no probe would find. So receivers on edges look at the sky
-# themselves, and where that differs from what probes say by more than this share, those so many pixels around on the
-# same body do.
+# Beside a contact the sky's light has a kink that no probe would find. So receivers on edges between two bodies that
+# are within so many pixels of one another in depth look at the sky themselves, and where that differs from what probes
+# say by more than a share, those so many pixels around on the same body do.
+CONTACT_REACH = 40
 KINKED, KINK_REACH = 0.1, 2
-BY_PROBES, ON_EDGE, BESIDE_KINK = 0, 1, 2
+BY_PROBES, ON_CONTACT, BESIDE_KINK = 0, 1, 2
 # Room for probes at first, as a share of the pixels; it grows when a picture needs more.
 FIRST_ROOM = 1 / 8
 
@@ -129,23 +130,51 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
     return SimpleNamespace(**vars(kit), receive_incident=receive_incident)
 
 
+@wp.func
+def touches(receivers: ReceiverTable, world: int, pixel: int, other: int, pixel_size: wp.vec2) -> bool:
+    """Whether two neighbouring pixels see two bodies that are near one another."""
+    entity = receivers.entity[world, other]
+    if entity < 0 or entity == receivers.entity[world, pixel]:
+        return False
+    apart = wp.abs(receivers.depth[world, other] - receivers.depth[world, pixel])
+    size = pixel_size[0] + pixel_size[1] * receivers.depth[world, pixel]
+    return apart < wp.static(float(CONTACT_REACH)) * size
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _find_pixels(
     first: int,
+    receivers: ReceiverTable,
     extra: wp.array2d(dtype=wp.int32),  # (world, pixel): its first extra slot, -1 for none
     extra_count: int,
+    width: int,
+    pixel_size: wp.vec2,
     pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
     looks_up: wp.array2d(dtype=wp.int32),  # (world, slot): see `LastGather`
 ):
     world, pixel = wp.tid()
     pixel += first
     pixel_of[world, pixel] = pixel
+    look = int(BY_PROBES)
     start = extra[world, pixel]
-    looks_up[world, pixel] = wp.where(start >= 0, wp.static(ON_EDGE), wp.static(BY_PROBES))
     if start >= 0:
+        x = pixel % width
+        contact = bool(False)
+        if receivers.entity[world, pixel] >= 0:
+            if x > 0:
+                contact = contact or touches(receivers, world, pixel, pixel - 1, pixel_size)
+            if x + 1 < width:
+                contact = contact or touches(receivers, world, pixel, pixel + 1, pixel_size)
+            if pixel >= width:
+                contact = contact or touches(receivers, world, pixel, pixel - width, pixel_size)
+            if pixel + width < extra.shape[1]:
+                contact = contact or touches(receivers, world, pixel, pixel + width, pixel_size)
+        if contact:
+            look = wp.static(ON_CONTACT)
         for place in range(extra_count):
             pixel_of[world, start + place] = pixel
-            looks_up[world, start + place] = wp.static(ON_EDGE)
+            looks_up[world, start + place] = look
+    looks_up[world, pixel] = look
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -178,20 +207,20 @@ def _number_probes(
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _settle_edges(
+def _settle_contacts(
     first: int,
     receivers: ReceiverTable,
     pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
     width: int,
-    seen: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance that receivers on edges found themselves
+    seen: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance that receivers on contacts found themselves
     seen_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
     looks_up: wp.array2d(dtype=wp.int32),  # (world, slot)
-    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot): from probes; receivers on edges get their own
+    diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot): from probes; receivers on contacts get their own
     glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
 ):
     world, slot = wp.tid()
     slot += first
-    if looks_up[world, slot] != wp.static(ON_EDGE) or receivers.entity[world, slot] < 0:
+    if looks_up[world, slot] != wp.static(ON_CONTACT) or receivers.entity[world, slot] < 0:
         return
     own = seen[world, slot]
     difference = wp.max(wp.abs(own - diffuse[world, slot]))
@@ -235,8 +264,8 @@ class LastGather:
     light: SH vectors of incident radiance (probe, channel), about the axes that `make_incident` says, of bounced light.
     sky: likewise, of what the bodies leave of the environment; empty where pixels receive that themselves.
     sky_received: what the pixels' receivers receive of that: irradiance and Phong radiance, vec3 (world, slot).
-    looks_up: which receivers look at the sky themselves, and why: BY_PROBES, ON_EDGE or BESIDE_KINK (world, slot).
-    own_sky: what those on edges receive of it by themselves.
+    looks_up: which receivers look at the sky themselves, and why: BY_PROBES, ON_CONTACT or BESIDE_KINK (world, slot).
+    own_sky: what those on contacts receive of it by themselves.
     """
 
     bounces: BounceState
@@ -296,6 +325,7 @@ def gather_last_bounce(
     pixels: ReceiverTable,
     extra: wp.array,
     extra_count: int,
+    pixel_size: wp.vec2,
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
@@ -308,6 +338,7 @@ def gather_last_bounce(
     """Fills `bounced`, irradiance and Phong radiance of the pixels' receivers, vec3 (world, slot).
 
     extra: int32 (world, pixel), an edge pixel's first extra slot, else -1; extra_count: how many it has.
+    pixel_size: how wide a pixel is at depth 0, metres, and how much wider it gets per metre.
     cuts: of the pixels' receivers, see `choose_cuts`. lattice: where direct light was interpolated between pixels, the
     bounced light is, too. direct: direct light likewise, to which the sky's is added where probes gather that.
     """
@@ -318,7 +349,8 @@ def gather_last_bounce(
     for array, value in ((table.probe, -1), (table.refined, 0), (gather.pixel_of, -1), (gather.chosen, 0)):
         array.fill_(value)
     gather.count = 0
-    launch(_find_pixels, extra.shape, [extra, extra_count], [gather.pixel_of, gather.looks_up], device)
+    inputs = [pixels, extra, extra_count, table.width, pixel_size]
+    launch(_find_pixels, extra.shape, inputs, [gather.pixel_of, gather.looks_up], device)
     seen = [pixels, scene.geometry, scene.poses, lighting.tables]
     cells = [-(-table.width // spacing) * -(-table.height // spacing) for spacing in SPACINGS]
     launch(_choose_lattice, (worlds, cells[0]), [SPACINGS[0], table, pixels], [gather.chosen], device)
@@ -364,11 +396,11 @@ def _finish_sky(
     lattice: Lattice,
     device: wp.Device,
 ) -> None:
-    """Brings the sky's light to where probes have not: receivers on edges, beside kinks, and in interpolated cells."""
+    """Brings the sky's light to where probes have not: to contacts, beside kinks, and to interpolated cells."""
     turns, lights = gather.looks_up, (scene, occlusion, lighting, cuts)
-    shade_direct(pixels, turns, ON_EDGE, *lights, *gather.own_sky, device)
+    shade_direct(pixels, turns, ON_CONTACT, *lights, *gather.own_sky, device)
     inputs = [pixels, gather.pixel_of, lattice.width, *gather.own_sky]
-    launch(_settle_edges, turns.shape, inputs, [turns, *gather.sky_received], device)
+    launch(_settle_contacts, turns.shape, inputs, [turns, *gather.sky_received], device)
     interpolate_lattice(lattice, pixels, *gather.sky_received, device)
     shade_direct(pixels, turns, BESIDE_KINK, *lights, *gather.sky_received, device)
 
