@@ -10,14 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from warp_psf.area_light.checks import MOST_RADIANCE, check_type, read_numbers
 from warp_psf.area_light.scene_map import PixelTable, SceneMap, retrieve_pixels
 from warp_psf.area_light.slab import ShadowSlab, SlabTable, upload_slab, visible_share
 from warp_psf.device import find_device, launch
 
 # Irradiance is kept in 2^-24ths of a W/m^2 in 64 bits: sums reach 5e11 W/m^2.
 FIXED_POINT = wp.constant(wp.float32(2.0**24))
-# The greatest radiance of a light sample; ten times the sun's.
-MOST_RADIANCE = 1.0e8
+# No Lambert patch of radiance 1 causes more irradiance, however near a sample's middle a point lies; and the least
+# squared distance, m^2: a point may lie on a sample.
+MOST_FORM, NEAREST_SQUARED = wp.constant(float(np.pi)), wp.constant(1.0e-18)
 # States of a light sample in the differential map.
 NEVER, SWITCHED_ON, STAYS_ON, SWITCHED_OFF = 1, 2, 3, 4
 
@@ -44,12 +46,18 @@ class SlabView:
     scene_map: of the viewpoint. slabs: one per light.
 
     Raises:
-        ValueError: there is no slab.
+        ValueError: there is no slab, or one is of another scene.
+        TypeError: one of them is something else.
     """
 
     def __init__(self, scene_map: SceneMap, slabs: Sequence[ShadowSlab], *, device: str | None = None):
-        if not slabs:
-            raise ValueError("there is no shadow slab; give at least one, from bake_shadow_slab")
+        if not isinstance(slabs, Sequence) or not slabs:
+            raise ValueError("slabs must be a list of at least one shadow slab; make them with bake_shadow_slab")
+        check_type("scene_map", scene_map, SceneMap, "bake_scene_map")
+        for light, slab in enumerate(slabs):
+            check_type(f"slab {light}", slab, ShadowSlab, "bake_shadow_slab")
+            if slab.scene != scene_map.scene:
+                raise ValueError(f"slab {light} is of another scene than the scene map; bake both from the same one")
         self._device = find_device(device)
         self._shape = (scene_map.height, scene_map.width)
         self._slabs = [upload_slab(slab, self._device) for slab in slabs]
@@ -70,10 +78,9 @@ class SlabView:
             IndexError: there is no such light.
             ValueError: the template has another shape, or a radiance is negative or no number.
         """
-        if not 0 <= light < len(self._slabs):
-            raise IndexError(f"there is no light {light}; the view has {len(self._slabs)}, counted from 0")
+        self._check_light(light)
         old = self._templates[light]
-        new = np.array(template, np.float32)
+        new = read_numbers(f"the template of light {light}", template, np.float32)
         if new.shape not in (old.shape, old.shape[:2]):
             raise ValueError(f"the template has the shape {new.shape}; light {light} has the samples {old.shape[:2]}")
         if not ((new >= 0.0) & (new <= MOST_RADIANCE)).all():
@@ -88,10 +95,12 @@ class SlabView:
 
     def template(self, light: int) -> np.ndarray:
         """The radiance of a light's samples, float32 [rows, columns, 3]."""
+        self._check_light(light)
         return self._templates[light].copy()
 
     def states(self, light: int) -> np.ndarray:
         """The differential map of a light after the last change, int8 [rows, columns]: states 1 to 4 of the thesis."""
+        self._check_light(light)
         return self._states[light].copy()
 
     def picture(self) -> np.ndarray:
@@ -107,6 +116,10 @@ class SlabView:
         lit, sent = self._lit.numpy().astype(np.float64), self._sent.numpy().astype(np.float64)
         share = np.divide(lit, sent, out=np.ones_like(lit), where=sent > 0)
         return share.reshape(*self._shape, 3).astype(np.float32)
+
+    def _check_light(self, light: int) -> None:
+        if not isinstance(light, (int, np.integer)) or not 0 <= light < len(self._slabs):
+            raise IndexError(f"there is no light {light!r}; the view has {len(self._slabs)}, counted from 0")
 
     def _reflected(self, irradiance: wp.array) -> np.ndarray:
         albedo = self._pixels.albedo.numpy()
@@ -160,9 +173,9 @@ def _update_pixels(
         leaving = wp.dot(shines, offset)
         arriving = -wp.dot(n, offset)
         if leaving > 0.0 and arriving > 0.0:
-            squared = wp.length_sq(offset)
+            squared = wp.max(wp.length_sq(offset), NEAREST_SQUARED)
             # cos cos area / distance^2, with both cosines over the distance.
-            form = leaving * arriving * slab.cell_area / (squared * squared)
+            form = wp.min(leaving * arriving * slab.cell_area / (squared * squared), MOST_FORM)
             before = form * was[place]
             after = form * becomes[place]
             sent += to_fixed_point(after) - to_fixed_point(before)

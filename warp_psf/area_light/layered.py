@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.area_light.checks import MOST_RADIANCE
 from warp_psf.area_light.light_samples import (
     PLASTIC,
     LightSamples,
@@ -34,7 +35,8 @@ PARTS = 4
 # How far out on a light's diagonals, in half diagonals, reference points stand: at its corners, and outside it.
 CORNERS, OUTSIDE = 1.0, 1.5
 FARTHEST = wp.constant(1.0e6)
-LARGEST_SIZE, MOST_SAMPLES = 4096, 4096
+# A map of 2048 x 2048 cells takes about 3 GB while it is made.
+LARGEST_SIZE, MOST_SAMPLES = 2048, 4096
 
 
 @wp.struct
@@ -59,6 +61,7 @@ class LayeredMap:
     first: where each cell's elements begin, int32 [cells + 1]; a face's cells lie by rows.
     surface: of each element, int32 [E]. visibility: share of the light that arrives, float32 [E].
     position, normal: world, float32 [E, 3].
+    scene: checksum of the scene.
     """
 
     light: LightSamples
@@ -74,6 +77,7 @@ class LayeredMap:
     visibility: np.ndarray
     position: np.ndarray
     normal: np.ndarray
+    scene: int
 
     @property
     def nbytes(self) -> int:
@@ -94,6 +98,7 @@ def bake_layered_map(
 
     Raises:
         ValueError: a number is not usable, the light hangs on a body, or nothing of the scene is before it.
+        TypeError: `scene` or `light` is something else.
     """
     if not isinstance(size, (int, np.integer)) or not 2 <= size <= LARGEST_SIZE:
         raise ValueError(f"size is {size!r}; give a whole number of cells from 2 to {LARGEST_SIZE}")
@@ -102,6 +107,11 @@ def bake_layered_map(
     on_device = find_device(device)
     still = upload_still(scene, on_device)
     points = sample_light(light, samples)
+    if light.radiance.max() > MOST_RADIANCE or np.abs(points.position).max() > FARTHEST:
+        raise ValueError(
+            f"light {light.name!r} is too bright, large or far away; give a radiance of at most {MOST_RADIANCE:g}, and "
+            f"coordinates within {FARTHEST:g} m"
+        )
     base, references = _reference_points(light)
     rotation, middle, half = _faces(still.table, light, base, on_device)
     frame = make_frame(base, rotation, middle, half, int(size), on_device)
@@ -111,6 +121,8 @@ def bake_layered_map(
         # Each view's rays go through other places of the cells.
         aside = (0.5 + view * PLASTIC) % 1.0
         elements.add(*_look_from(still.table, frame, fine, reference, aside, on_device))
+    if not len(elements.keys):
+        raise ValueError(f"nothing of the scene is before light {light.name!r}; move it to the scene")
     cell, kept = elements.sorted(int(size))
     visibility = _ask(still.table, upload_light(points, on_device), kept, on_device)
     first = np.searchsorted(cell, np.arange(len(rotation) * size**2 + 1)).astype(np.int32)
@@ -128,6 +140,7 @@ def bake_layered_map(
         visibility,
         kept["position"],
         kept["normal"],
+        scene.checksum,
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.area_light.checks import check_type
 from warp_psf.area_light.tracing import StillTable, sees
 from warp_psf.scene.light import AreaLight
 
@@ -61,7 +62,9 @@ def sample_light(light: AreaLight, count: int) -> LightSamples:
 
     Raises:
         ValueError: the light hangs on a body, or `count` is no whole number from 1 to 65536.
+        TypeError: it is no area light.
     """
+    check_type("light", light, AreaLight, "rectangle_light or sphere_light")
     if light.body is not None:
         raise ValueError(f"light {light.name!r} hangs on the body {light.body!r}; give it a place in the world")
     if not isinstance(count, (int, np.integer)) or not 1 <= count <= 65536:

@@ -8,17 +8,21 @@ A divided square also leaves a stand-in, which is shown in place of all its poin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 
+from warp_psf.area_light.checks import check_type
 from warp_psf.scene.still import StillScene
 
 # The smallest squares of a scene that says nothing else are this share of its extent.
 SMALLEST_SHARE = 1.0 / 1000.0
+# Metres; float32 holds the places of larger ones, too, but no scene has any.
+LARGEST_SQUARE = 1.0e9
 # Points of a triangle that are culled, and carried to the device's cores, together.
 POINTS_PER_GROUP = 256
-# More points than this are a mistaken square size, not a wish: 3 GB.
-MOST_POINTS = 200_000_000
+# More squares than this are a mistaken size, not a wish: 6 GB while they are told apart.
+MOST_POINTS = 100_000_000
 # Squares that are tested at a time.
 SQUARES_AT_A_TIME = 1 << 21
 
@@ -72,15 +76,21 @@ def sample_points(scene: StillScene, *, smallest: float | None = None, levels: i
     A triangle smaller than the smallest square is one point. Source: Jeng 2005, section 5.2.2.
 
     Raises:
-        ValueError: a value is not usable, or there would be more than 200 million points.
+        ValueError: a value is not usable, or there would be more than 100 million points.
+        TypeError: `scene` is no still scene.
     """
-    if levels not in (1, 2, 3, 4, 5, 6):
+    check_type("scene", scene, StillScene, "freeze_scene or make_still")
+    if not isinstance(levels, (int, np.integer)) or not 1 <= levels <= 6:
         raise ValueError(f"levels is {levels!r}; give 1 to 6 lists, of which 3 or 4 suit most meshes")
     corners = scene.vertices[scene.faces].astype(np.float64)
     extent = float(np.ptp(scene.vertices, axis=0).max())
     smallest = SMALLEST_SHARE * extent if smallest is None else smallest
-    if not 0.0 < smallest < np.inf:
-        raise ValueError(f"smallest is {smallest!r}; give the side of the smallest squares in metres, above 0")
+    if not isinstance(smallest, Real) or not 0.0 < smallest <= LARGEST_SQUARE:
+        raise ValueError(
+            f"smallest is {smallest!r}; give the side of the smallest squares in metres, above 0 and at most "
+            f"{LARGEST_SQUARE:g}"
+        )
+    smallest, levels = float(smallest), int(levels)
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     largest = smallest * 2.0 ** (levels - 1)
     if area.sum() / largest**2 > MOST_POINTS:
@@ -190,7 +200,7 @@ def _grouped(
         stand_ins.append(np.full(len(whole), stands_in))
     triangle = np.concatenate(triangles).astype(np.int32)
     return PointLists(
-        float(smallest),
+        smallest,
         levels,
         origin,
         axes,

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.area_light.atomics import add_to
+from warp_psf.area_light.checks import check_picture, check_type
 from warp_psf.area_light.layered import FrameTable, LayeredMap, cell_of, make_frame
 from warp_psf.area_light.light_samples import (
     BrightTable,
@@ -43,7 +44,6 @@ FOOTPRINTS, SLOPE = wp.constant(3.0), wp.constant(0.5)
 BEHIND = wp.constant(0.98)
 # Visibility is summed in these parts, below a count in the highest 24 bits: 2^24 points in a pixel.
 PARTS, COUNT_SHIFT = wp.constant(wp.float32(65536.0)), wp.constant(wp.uint64(40))
-LARGEST_PICTURE = 16384
 
 
 @wp.struct
@@ -93,7 +93,16 @@ class ShadowPicture:
 
 
 def upload_layers(layered: LayeredMap, scene: StillScene, device: str | None = None) -> DeviceLayers:
-    """Brings a layered map and its scene to the device."""
+    """Brings a layered map and its scene to the device.
+
+    Raises:
+        ValueError: the map is of another scene.
+        TypeError: one of them is something else.
+    """
+    check_type("layered", layered, LayeredMap, "bake_layered_map")
+    check_type("scene", scene, StillScene, "freeze_scene or make_still")
+    if layered.scene != scene.checksum:
+        raise ValueError("the layered map is of another scene; bake one of this scene")
     on_device = find_device(device)
     table = LayerTable()
     table.first = wp.array(layered.first, dtype=wp.int32, device=on_device)
@@ -115,7 +124,7 @@ def project_forward(layers: DeviceLayers, camera: Camera, width: int, height: in
         ValueError: the picture has no size.
     """
     view, screen = _look(layers, camera, width, height)
-    device, pixels = layers.device, width * height
+    device, pixels = layers.device, screen.width * screen.height
     sums = wp.zeros(pixels, dtype=wp.uint64, device=device)
     inputs = [layers.layers, view, screen]
     launch(_project_points, (1, layers.layers.surface.shape[0]), inputs, [sums], device)
@@ -136,9 +145,10 @@ def retrieve_backward(layers: DeviceLayers, camera: Camera, width: int, height: 
         ValueError: the picture has no size.
     """
     _, screen = _look(layers, camera, width, height)
-    visibility = wp.zeros((1, width * height), dtype=wp.float32, device=layers.device)
+    shape = (1, screen.width * screen.height)
+    visibility = wp.zeros(shape, dtype=wp.float32, device=layers.device)
     inputs = [screen, layers.frame, layers.layers]
-    launch(_retrieve_pixels, (1, width * height), inputs, [visibility], layers.device)
+    launch(_retrieve_pixels, shape, inputs, [visibility], layers.device)
     return _picture(layers, screen, visibility)
 
 
@@ -149,19 +159,19 @@ def trace_view(layers: DeviceLayers, camera: Camera, width: int, height: int) ->
         ValueError: the picture has no size.
     """
     _, screen = _look(layers, camera, width, height)
-    visibility = wp.zeros((1, width * height), dtype=wp.float32, device=layers.device)
+    shape = (1, screen.width * screen.height)
+    visibility = wp.zeros(shape, dtype=wp.float32, device=layers.device)
     inputs = [layers.still.table, layers.light, screen]
-    launch(_trace_pixels, (1, width * height), inputs, [visibility], layers.device)
+    launch(_trace_pixels, shape, inputs, [visibility], layers.device)
     return _picture(layers, screen, visibility)
 
 
 def _look(layers: DeviceLayers, camera: Camera, width: int, height: int) -> tuple[ViewTable, ScreenTable]:
     """The screen buffer without shadows."""
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or not 1 <= value <= LARGEST_PICTURE:
-            raise ValueError(f"{name} is {value!r}; give a whole number of pixels from 1 to {LARGEST_PICTURE}")
+    check_type("layers", layers, DeviceLayers, "upload_layers")
+    width, height = check_picture(width, height)
     view, screen = make_view(camera, width, height), ScreenTable()
-    screen.width, screen.height = int(width), int(height)
+    screen.width, screen.height = width, height
     shape = (1, width * height)
     screen.surface = wp.zeros(shape, dtype=wp.int32, device=layers.device)
     for name in ("position", "normal", "facing", "color"):

@@ -9,8 +9,11 @@ import numpy as np
 
 # Corners of a cell, in the order in which everything here has them: (column, row) in cells.
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-# Maps that grow at a time: each has a dense table of its sample numbers while it grows.
-MAPS_AT_A_TIME = 64
+# Maps that grow at a time, and how many places they may have together, a number each in a dense table: more maps of
+# 513 x 513 than four take longer, and much memory where they are full.
+MAPS_AT_A_TIME, PLACES_AT_A_TIME = 64, 4 * 513**2
+# More samples than this are a mistaken size, not a wish: 6 GB.
+MOST_SAMPLES = 200_000_000
 
 Sample = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
 Split = Callable[[np.ndarray, tuple[np.ndarray, ...]], np.ndarray]
@@ -69,12 +72,22 @@ def grow_quadtrees(maps: int, size: int, preset: int, sample: Sample, split: Spl
         level and those of side 1 are not asked.
 
     Source: Jeng 2005, section 3.2.2.
+
+    Raises:
+        ValueError: there are more than `MOST_SAMPLES`.
     """
-    groups = [
-        _grow(np.arange(begin, min(begin + MAPS_AT_A_TIME, maps)), size, preset, sample, split)
-        for begin in range(0, maps, MAPS_AT_A_TIME)
-    ]
+    at_a_time = min(MAPS_AT_A_TIME, max(1, PLACES_AT_A_TIME // size**2))
+    _check_samples(maps * (2**preset + 1) ** 2)
+    groups: list[Quadtrees] = []
+    for begin in range(0, maps, at_a_time):
+        groups.append(_grow(np.arange(begin, min(begin + at_a_time, maps)), size, preset, sample, split))
+        _check_samples(sum(int(group.first_sample[-1]) for group in groups))
     return groups[0] if len(groups) == 1 else _join(groups)
+
+
+def _check_samples(count: int) -> None:
+    if count > MOST_SAMPLES:
+        raise ValueError(f"the maps have more than {MOST_SAMPLES} samples; make them smaller, or fewer")
 
 
 class _Samples:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.area_light.checks import check_picture
 from warp_psf.area_light.quadtree import Quadtrees, grow_quadtrees
 from warp_psf.area_light.tracing import (
     StillTable,
@@ -26,6 +27,8 @@ COARSEST = 16
 # their normals by more than this angle's cosine (8 degrees): between corners both are interpolated.
 DEPTH_SPREAD, ALIKE = 0.01, 0.99
 LARGEST_PICTURE = 4096
+# What lies nearer than this, metres, as where a camera stands on a surface, counts as this near.
+NEAREST = wp.constant(1.0e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,7 @@ class SceneMap:
     flat: whether each surface of the scene is a plane, bool [surfaces].
     maps: one map whose samples lie at pixels' centres, of (inverse depth 1/m, or depth for an orthographic camera,
         float32; surface, int32, -1 where nothing is; smooth normal, float32 [3]; albedo, float32 [3]).
+    scene: checksum of the scene.
     """
 
     camera: Camera
@@ -42,6 +46,7 @@ class SceneMap:
     height: int
     flat: np.ndarray
     maps: Quadtrees
+    scene: int
 
     @property
     def share(self) -> float:
@@ -58,16 +63,15 @@ def bake_scene_map(
 
     Raises:
         ValueError: there is no such camera, or the picture has no size.
+        TypeError: `scene` is no still scene.
     """
-    if not isinstance(camera, (int, np.integer)) or not 0 <= camera < len(scene.cameras):
-        raise ValueError(f"camera is {camera!r}; the scene has {len(scene.cameras)} cameras, counted from 0")
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or not 2 <= value <= LARGEST_PICTURE:
-            raise ValueError(f"{name} is {value!r}; give a whole number of pixels from 2 to {LARGEST_PICTURE}")
+    width, height = check_picture(width, height, 2, LARGEST_PICTURE)
     on_device = find_device(device)
     still = upload_still(scene, on_device)
+    if not isinstance(camera, (int, np.integer)) or not 0 <= camera < len(scene.cameras):
+        raise ValueError(f"camera is {camera!r}; the scene has {len(scene.cameras)} cameras, counted from 0")
     view = make_view(scene.cameras[camera], width, height)
-    levels = max(int(max(width, height) - 2).bit_length(), 1)
+    levels = max((max(width, height) - 2).bit_length(), 1)
     preset = max(levels - COARSEST.bit_length() + 1, 0)
 
     def sample(_maps: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -90,7 +94,7 @@ def bake_scene_map(
         return within & (~one | (curved & (bent | steep)))
 
     maps = grow_quadtrees(1, 2**levels + 1, preset, sample, split)
-    return SceneMap(scene.cameras[camera], int(width), int(height), scene.flat, maps)
+    return SceneMap(scene.cameras[camera], width, height, scene.flat, maps, scene.checksum)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -110,7 +114,7 @@ def _sample_view(
     hit = meet(still, view_origin(view, at[0], at[1]), view_direction(view, at[0], at[1]), view.far)
     surface_out[index] = hit.surface
     if hit.face >= 0:
-        depth_out[index] = wp.where(view.orthographic, hit.distance, 1.0 / hit.distance)
+        depth_out[index] = wp.where(view.orthographic, hit.distance, 1.0 / wp.max(hit.distance, NEAREST))
         normal_out[index] = smooth_normal(still, hit)
         albedo_out[index] = still.albedo[hit.face]
 

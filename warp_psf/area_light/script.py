@@ -23,11 +23,13 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import numpy as np
 
 from warp_psf.area_light.attenuation import SlabView
+from warp_psf.area_light.checks import check_type
 from warp_psf.area_light.scene_map import bake_scene_map
 from warp_psf.area_light.slab import LightPlane, bake_shadow_slab, make_light_plane
 from warp_psf.area_light.templates import SHAPES
@@ -86,7 +88,7 @@ def read_script(path: str | Path) -> Script:
     if path.stat().st_size > LARGEST_FILE:
         raise ValueError(f"script {str(path)!r} has more than {LARGEST_FILE} bytes; split it")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"script {str(path)!r} is no JSON file: {error}") from error
     try:
@@ -112,15 +114,16 @@ def play_script(
     Raises:
         ValueError: the scene has another number of cameras, or a size is not usable.
     """
+    check_type("script", script, Script, "read_script")
+    check_type("scene", scene, StillScene, "freeze_scene or make_still")
     if len(scene.cameras) != len(script.cameras):
         raise ValueError(
             f"the scene has {len(scene.cameras)} cameras, the script {len(script.cameras)}; freeze it with its"
         )
+    # What is quick comes first, so that a picture that cannot be is refused at once.
+    maps = [bake_scene_map(scene, camera, width, height, device=device) for camera in range(len(scene.cameras))]
     slabs = [bake_shadow_slab(scene, plane, size, device=device) for plane in script.lights.values()]
-    views = [
-        SlabView(bake_scene_map(scene, camera, width, height, device=device), slabs, device=device)
-        for camera in range(len(scene.cameras))
-    ]
+    views = [SlabView(scene_map, slabs, device=device) for scene_map in maps]
     names = list(script.lights)
     planes = list(script.lights.values())
     states: list[dict[str, Any]] = [dict(DARK, on=False) for _ in names]
@@ -180,7 +183,7 @@ def _read(content: Any) -> Script:
         raise ValueError('steps must be a list, for example [{"frames": 1}]')
     script = Script(tuple(cameras), planes, tuple(_read_step(*each, cameras, planes) for each in enumerate(steps)))
     if script.frames > MOST_FRAMES:
-        raise ValueError(f"its {script.frames} frames are more than {MOST_FRAMES}; shorten the steps")
+        raise ValueError(f"its {brief(script.frames)} frames are more than {MOST_FRAMES}; shorten the steps")
     return script
 
 
@@ -203,9 +206,9 @@ def _read_step(number: int, step: Any, cameras: list[str], planes: dict[str, Lig
     _check_keys(step, owner, {"frames", "camera", *planes})
     frames, camera = step.get("frames", 1), step.get("camera")
     if not isinstance(frames, int) or isinstance(frames, bool) or frames < 1:
-        raise ValueError(f"{owner}: frames is {frames!r}; give a whole number of at least 1")
+        raise ValueError(f"{owner}: frames is {brief(frames)}; give a whole number of at least 1")
     if camera is not None and camera not in cameras:
-        raise ValueError(f"{owner}: camera {camera!r} is not among {', '.join(cameras)}")
+        raise ValueError(f"{owner}: camera {brief(camera)} is not among {', '.join(cameras)}")
     lights = {name: _read_change(f"{owner}: {name}", step[name]) for name in planes if name in step}
     return Step(frames, camera, lights)
 
@@ -216,11 +219,11 @@ def _read_change(owner: str, change: Any) -> dict[str, Any]:
     read: dict[str, Any] = {}
     for name, value in change.items():
         if name == "on" and not isinstance(value, bool):
-            raise ValueError(f"{owner}: on is {value!r}; give true or false")
-        if name == "shape" and value not in SHAPES:
-            raise ValueError(f"{owner}: shape {value!r} is unknown; choose {', '.join(SHAPES)}")
+            raise ValueError(f"{owner}: on is {brief(value)}; give true or false")
+        if name == "shape" and value not in list(SHAPES):
+            raise ValueError(f"{owner}: shape {brief(value)} is unknown; choose {', '.join(SHAPES)}")
         if name == "text" and not (isinstance(value, str) and 0 < len(value.strip()) <= 64):
-            raise ValueError(f"{owner}: text is {value!r}; give 1 to 64 letters")
+            raise ValueError(f"{owner}: text is {brief(value)}; give 1 to 64 letters")
         read[name] = _numbers(value, sizes[name], f"{owner}: {name}") if name in sizes else value
     if min(np.atleast_1d(read.get("radiance", 0.0))) < 0.0:
         raise ValueError(f"{owner}: radiance is below 0; give numbers of at least 0")
@@ -233,15 +236,13 @@ def _numbers(value: Any, count: int, owner: str) -> Any:
     plain = isinstance(given, list) and len(given) == count
     if not plain or not all(type(each) in (int, float) and abs(each) <= 1e6 for each in given):
         wanted = "a number" if count == 1 else f"{count} numbers"
-        raise ValueError(f"{owner} is {value!r}; give {wanted} within a million")
+        raise ValueError(f"{owner} is {brief(value)}; give {wanted} within a million")
     return float(value) if count == 1 else tuple(map(float, value))
 
 
 def _check_keys(value: Any, owner: str, known: set[str]) -> None:
     if not isinstance(value, dict):
-        raise ValueError(f"{owner} is {value!r}; give an object in braces")
+        raise ValueError(f"{owner} is {brief(value)}; give an object in braces")
     unknown = sorted(set(value) - known)
     if unknown:
-        raise ValueError(
-            f"{owner} has {', '.join(map(repr, unknown))}, which is unknown; it may have {', '.join(sorted(known))}"
-        )
+        raise ValueError(f"{owner} has {brief(unknown[0])}, which is unknown; it may have {', '.join(sorted(known))}")

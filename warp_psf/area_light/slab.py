@@ -6,10 +6,12 @@ leaf's corners hold a flat surface exactly, however steep it is, and only edges 
 """
 
 from dataclasses import dataclass
+from reprlib import repr as brief
 
 import numpy as np
 import warp as wp
 
+from warp_psf.area_light.checks import check_type, read_numbers
 from warp_psf.area_light.quadtree import Quadtrees, grow_quadtrees, levels_of
 from warp_psf.area_light.tracing import StillTable, meet, seen_points, upload_still
 from warp_psf.device import find_device, launch
@@ -32,6 +34,10 @@ FARTHEST, NEAREST = wp.constant(1.0e6), wp.constant(1.0e-4)
 MOST_SAMPLES = 64
 # Rays per side with which a camera finds out what a slab must cover, and how much wider than that the maps are.
 PROBES, MARGIN = 64, 1.02
+# So few rays that meet something do not tell how wide it is: then the maps cover the whole scene.
+FEWEST_SEEN = 64
+# Half a map's side is this at least, as a tangent: what lies too far aside for any map may shrink to a point.
+NARROWEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +60,22 @@ class LightPlane:
 
     def __post_init__(self) -> None:
         for name in ("center", "right", "up"):
-            value = np.array(getattr(self, name), np.float64)
-            if value.shape != (3,) or not np.isfinite(value).all():
-                raise ValueError(f"{name} of a light plane is {getattr(self, name)!r}; give three numbers, metres")
+            given = getattr(self, name)
+            value = read_numbers(f"{name} of a light plane", given)
+            if value.shape != (3,) or not (np.abs(value) <= FARTHEST).all():
+                raise ValueError(
+                    f"{name} of a light plane is {brief(given)}; give three numbers, metres, to {FARTHEST:g}"
+                )
             object.__setattr__(self, name, value)
         lengths = np.linalg.norm(self.right), np.linalg.norm(self.up)
         if min(lengths) < 1e-9 or abs(self.right @ self.up) > 1e-4 * lengths[0] * lengths[1]:
             raise ValueError("right and up of a light plane must have a length and be at right angles; change one")
         for name in ("rows", "columns"):
             value = getattr(self, name)
-            if not isinstance(value, (int, np.integer)) or not 1 <= value <= MOST_SAMPLES:
-                raise ValueError(f"{name} of a light plane is {value!r}; give a whole number from 1 to {MOST_SAMPLES}")
+            if not isinstance(value, (int, np.integer)) or not 1 <= value <= MOST_SAMPLES or isinstance(value, bool):
+                raise ValueError(
+                    f"{name} of a light plane is {brief(value)}; give a whole number from 1 to {MOST_SAMPLES}"
+                )
             object.__setattr__(self, name, int(value))
 
     @property
@@ -91,7 +102,9 @@ def make_light_plane(light: AreaLight, rows: int, columns: int) -> LightPlane:
 
     Raises:
         ValueError: the light is no flat rectangle or hangs on a body, or there is no row or column.
+        TypeError: it is no area light.
     """
+    check_type("light", light, AreaLight, "rectangle_light")
     slab = light.mesh.slab
     if slab is None or slab[2][2] > 0.0 or light.body is not None:
         raise ValueError(f"light {light.name!r} is no flat rectangle in the world; make one with rectangle_light")
@@ -109,12 +122,14 @@ class ShadowSlab:
     window: of each sample's map: the middle of its square (right, up), tangents, float32 [maps, 2].
     half: half the square's side, as a tangent.
     maps: samples are (inverse depth 1/m, float32; surface, int32; 0 and -1 where nothing is).
+    scene: checksum of the scene.
     """
 
     plane: LightPlane
     window: np.ndarray
     half: float
     maps: Quadtrees
+    scene: int
 
     @property
     def share(self) -> float:
@@ -137,8 +152,10 @@ def bake_shadow_slab(
     all of the scene.
 
     Raises:
-        ValueError: a value is not usable, or nothing of the scene is before the plane.
+        ValueError: a value is not usable, nothing of the scene is before the plane, or the maps are too many and large.
+        TypeError: `scene` or `plane` is something else.
     """
+    check_type("plane", plane, LightPlane, "make_light_plane")
     levels = levels_of(size, "size of a shadow map")
     preset = min(PRESET, levels) if preset is None else preset
     if not isinstance(preset, (int, np.integer)) or not 0 <= preset <= levels:
@@ -166,7 +183,7 @@ def bake_shadow_slab(
         return ~one | (curved & (inverse.max(axis=1) > (1.0 + DEPTH_SPREAD) * inverse.min(axis=1)))
 
     maps = grow_quadtrees(len(positions), size, int(preset), sample, split)
-    return ShadowSlab(plane, window.astype(np.float32), half, maps)
+    return ShadowSlab(plane, window.astype(np.float32), half, maps, scene.checksum)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -197,7 +214,8 @@ def _cover(
     """
     points = scene.vertices.astype(np.float64)
     if scene.cameras:
-        points = np.concatenate([seen_points(still, camera, PROBES, device) for camera in scene.cameras])
+        seen = np.concatenate([seen_points(still, camera, PROBES, device) for camera in scene.cameras])
+        points = points if len(seen) < FEWEST_SEEN else seen
     local = (points - plane.center) @ plane.axes
     local = local[local[:, 2] > 0.0]
     if not len(local):
@@ -211,7 +229,7 @@ def _cover(
         at = corner + focus * tangent
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
     half = MARGIN * 0.5 * float((high - low).max())
-    return (0.5 * (low + high) - samples[:, :2]) / focus, half / focus
+    return (0.5 * (low + high) - samples[:, :2]) / focus, max(half / focus, NARROWEST)
 
 
 @wp.struct
@@ -248,8 +266,8 @@ def visible_share(slab: SlabTable, sample: int, p: wp.vec3, n: wp.vec3, surface:
     to_cells = 0.5 * slab.cells / slab.half
     u = (inverse * wp.dot(offset, x) - window[0] + slab.half) * to_cells
     v = (window[1] + slab.half - inverse * wp.dot(offset, y)) * to_cells
-    if wp.min(u, v) < 0.0 or wp.max(u, v) > slab.cells:
-        # Beyond the map nothing is known to be in the way.
+    if not (u >= 0.0 and v >= 0.0 and u <= slab.cells and v <= slab.cells):
+        # Beyond the map nothing is known to be in the way. What is no number, by a point within the plane, is beyond.
         return 1.0
     side = slab.cells / float(slab.grid)
     column = wp.min(int(u / side), slab.grid - 1)

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.area_light.atomics import add_to, lower_to
+from warp_psf.area_light.checks import check_picture, check_type
 from warp_psf.area_light.points import PointLists
 from warp_psf.area_light.tracing import ViewTable, make_view
 from warp_psf.device import find_device, launch
@@ -28,7 +29,6 @@ OVERHANG = wp.constant(0.5)
 # A square whose nearest corner has less than this share of its middle's depth may be anywhere in the picture: so close
 # to the camera's plane, bounds of its projection are no bounds.
 SHALLOWEST = wp.constant(0.02)
-LARGEST_PICTURE = 16384
 
 
 @wp.struct
@@ -79,7 +79,12 @@ class PointPicture:
 
 
 def upload_points(lists: PointLists, device: str | None = None) -> DevicePoints:
-    """Brings point lists to the device."""
+    """Brings point lists to the device.
+
+    Raises:
+        TypeError: they are something else.
+    """
+    check_type("lists", lists, PointLists, "sample_points")
     on_device = find_device(device)
     order = np.argsort(lists.level, kind="stable")
     counts = np.diff(lists.first)[order]
@@ -106,11 +111,11 @@ def splat_points(points: DevicePoints, camera: Camera, width: int, height: int) 
     Source: Jeng 2005, section 5.3. Depths within a splat are those of its triangle's plane.
 
     Raises:
-        ValueError: the picture has no size.
+        ValueError: the picture has no size, or the camera has no pose or film.
+        TypeError: `points` or `camera` is something else.
     """
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or not 1 <= value <= LARGEST_PICTURE:
-            raise ValueError(f"{name} is {value!r}; give a whole number of pixels from 1 to {LARGEST_PICTURE}")
+    check_type("points", points, DevicePoints, "upload_points")
+    width, height = check_picture(width, height)
     device, pixels = points.device, width * height
     view = make_view(camera, width, height)
     keys = wp.empty((1, pixels), dtype=wp.uint64, device=device)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.area_light.checks import check_type
 from warp_psf.device import launch
 from warp_psf.scene.camera import Camera
 from warp_psf.scene.still import StillScene
@@ -12,6 +13,8 @@ from warp_psf.scene.still import StillScene
 # Shadow rays begin and end this share of the coordinates' size off the surfaces that they join: float32 keeps seven
 # digits, and a hit's position loses one of them.
 OFFSET = 4.0e-6
+# R R^T of a rotation may differ from the identity by this much: float32 matrices and printed decimals pass.
+ORTHONORMAL = 1.0e-4
 
 
 @wp.struct
@@ -123,7 +126,12 @@ def view_origin(view: ViewTable, x: float, y: float) -> wp.vec3:
 
 
 def upload_still(scene: StillScene, device: wp.Device) -> DeviceStill:
-    """Puts a still scene on the device."""
+    """Puts a still scene on the device.
+
+    Raises:
+        TypeError: it is no still scene.
+    """
+    check_type("scene", scene, StillScene, "freeze_scene or make_still")
     table = StillTable()
     table.vertices = wp.array(scene.vertices, dtype=wp.vec3, device=device)
     table.normals = wp.array(scene.normals, dtype=wp.vec3, device=device)
@@ -165,12 +173,24 @@ def _find_points(
 
 
 def make_view(camera: Camera, width: int, height: int) -> ViewTable:
-    """A camera for a picture of width x height pixels."""
+    """A camera for a picture of width x height pixels.
+
+    Raises:
+        TypeError: it is no camera.
+        ValueError: a pose or a film that is none: rays without a direction would be looked up where no map is.
+    """
+    check_type("camera", camera, Camera, "a StillScene's cameras")
+    rotation, half = np.asarray(camera.rotation), camera.half_sizes(width, height)
+    turned = rotation.shape == (3, 3) and np.abs(rotation @ rotation.T - np.eye(3)).max() < ORTHONORMAL
+    if not turned or np.shape(camera.position) != (3,) or not np.isfinite(camera.position).all():
+        raise ValueError("the camera's pose is none; give a position of 3 finite numbers and a rotation matrix")
+    if not (0.0 < min(half) <= max(half) < np.inf and np.isfinite(camera.center).all() and camera.near < camera.far):
+        raise ValueError("the camera's film is none; give sizes above 0, a finite center, and near below far")
     view = ViewTable()
     view.position = wp.vec3(*map(float, camera.position))
     view.rotation = wp.mat33(*map(float, np.asarray(camera.rotation).ravel()))
     view.center = wp.vec2(*map(float, camera.center))
-    view.half = wp.vec2(*map(float, camera.half_sizes(width, height)))
+    view.half = wp.vec2(*map(float, half))
     view.near, view.far = float(camera.near), float(camera.far)
     view.orthographic = camera.orthographic
     return view

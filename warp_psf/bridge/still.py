@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import mujoco
@@ -34,13 +35,20 @@ def freeze_scene(
 
     Raises:
         ValueError: there is no such camera, `data` is of another model, or nothing is drawn.
+        TypeError: an argument is something else.
     """
+    option = mujoco.MjvOption() if scene_option is None else scene_option
+    for name, value, wanted in (("model", model, mujoco.MjModel), ("scene_option", option, mujoco.MjvOption)):
+        if not isinstance(value, wanted):
+            raise TypeError(f"{name} is a {type(value).__name__}; give a mujoco.{wanted.__name__}")
+    if not isinstance(cameras, Sequence) or isinstance(cameras, str):
+        raise TypeError(f"cameras is {cameras!r}; give a list of names or numbers, such as [-1]")
     if data is None:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-    option = mujoco.MjvOption() if scene_option is None else scene_option
     views = [read_camera(model, data, camera) for camera in cameras]
-    bodies = meet_deforming(model, data, option, material_space) if model.nflex + model.nskin else ()
+    # Of a copy: meeting bodies moves the flexes of the state.
+    bodies = meet_deforming(model, copy(data), option, material_space) if model.nflex + model.nskin else ()
     shapes = tuple(body.shape for body in bodies)
     scene = build_scene(model, option=option, material_space=material_space, model_lights=False, deforming=shapes)
     poses = read_poses(model, data, scene, views[0].position if views else None)

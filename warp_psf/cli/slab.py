@@ -51,12 +51,12 @@ def slab(
             "view": view,
         }
         kinds = tuple(part.strip() for part in formats.split(","))
-        frames = play_script(played, scene, width, height, size=map_size, device=device)
-        # What cannot be used is refused before the folder is touched.
-        first = next(frames)
         sequence = FrameSequence(
             out, settings, frames=range(played.frames), formats=kinds, frames_per_second=fps, overwrite=overwrite
         )
+        frames = play_script(played, scene, width, height, size=map_size, device=device)
+        # What cannot be used is refused before the folder is touched.
+        first = next(frames)
         with progress_bar() as bar, sequence:
             task = bar.add_task("Frames", total=played.frames, rate="")
             for index, frame in enumerate(itertools.chain([first], frames)):

@@ -12,8 +12,8 @@ from warp_psf.cli.console import one_sentence
 from warp_psf.cli.options import LIGHT, OUTPUT, PICTURE, option, parse_size
 
 MESHES = (".obj", ".stl", ".ply", ".glb")
-# A mesh without a camera is seen from this side, in the middle of a film of 40 degrees.
-SIDE, HALF_HEIGHT = (0.6, -0.75, 0.45), 0.364
+# A mesh without a camera is seen from this side, in the middle of a film of 40 degrees, with this albedo.
+SIDE, HALF_HEIGHT, GREY = (0.6, -0.75, 0.45), 0.364, 0.8
 
 Out = Annotated[Path, option(OUTPUT, "Folder for the pictures.", "DIR")]
 Overwrite = Annotated[
@@ -49,7 +49,7 @@ def layered(
     Writes a PNG and an EXR with the layers color and visibility per camera. (Jeng 2005, chapter 4.)
     """
     with one_sentence("stopped"):
-        width, height = parse_size(size)
+        width, height = _check_picture(size, exposure, view)
         from warp_psf.area_light import bake_layered_map, project_forward, upload_layers
         from warp_psf.scene.light import rectangle_light
 
@@ -94,7 +94,7 @@ def points(
     Writes a PNG and an EXR with the layers color and depth per camera. (Jeng 2005, chapter 5.)
     """
     with one_sentence("stopped"):
-        width, height = parse_size(size)
+        width, height = _check_picture(size, exposure, view)
         from warp_psf.area_light import sample_points, splat_points, upload_points
 
         names, scene = _freeze(source, camera)
@@ -109,6 +109,18 @@ def points(
 
         _write(paths, scene, shoot, exposure, view)
         typer.echo(f"{len(names)} pictures: {out}")
+
+
+def _check_picture(size: str, exposure: float, view: str) -> tuple[int, int]:
+    """Width and height; refuses a picture that cannot be, before much is done for it."""
+    width, height = parse_size(size)
+    import numpy as np
+
+    from warp_psf.area_light.checks import check_picture
+    from warp_psf.film.display import to_display
+
+    to_display(np.zeros((1, 1, 3), np.float32), exposure=exposure, view=view)
+    return check_picture(width, height)
 
 
 def _freeze(source: Path, cameras: list[str] | None) -> tuple[list[str], Any]:
@@ -133,7 +145,7 @@ def _freeze_mesh(source: Path) -> Any:
 
     from warp_psf.scene.camera import Camera
     from warp_psf.scene.mesh import load_mesh
-    from warp_psf.scene.still import make_still
+    from warp_psf.scene.still import Piece, join_pieces
 
     mesh = load_mesh(source)
     back = np.array(SIDE) / np.linalg.norm(SIDE)
@@ -142,14 +154,20 @@ def _freeze_mesh(source: Path) -> Any:
     # The bounding sphere touches the film's upper and lower edge.
     position = mesh.center + mesh.radius * np.sqrt(1.0 + HALF_HEIGHT**-2) * back
     rotation = np.stack([right, np.cross(back, right), back], axis=1)
-    return make_still(mesh.vertices, mesh.faces, cameras=[Camera(position, rotation, HALF_HEIGHT)])
+    grey = np.full(mesh.faces.shape, GREY, np.float32)
+    piece = Piece(mesh.vertices, mesh.normals, mesh.faces, grey)
+    return join_pieces([piece], [Camera(position, rotation, HALF_HEIGHT)])
 
 
 def _paths(out: Path, names: list[str], overwrite: bool) -> list[Path]:
-    """Where the pictures go, without suffix; refuses to replace any unasked."""
+    """Where the pictures go, without suffix; refuses to replace any unasked, or one by another."""
     from warp_psf.film.writer import write_error
 
-    paths = [out / name.replace("/", "_") for name in names]
+    labels = [name.replace("/", "_") for name in names]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ValueError(f"{labels.count(label)} cameras would write {label}.png; choose one with --camera")
+    paths = [out / label for label in labels]
     there = [path.with_name(path.name + suffix) for path in paths for suffix in (".png", ".exr")]
     present = [path for path in there if path.exists()]
     if present and not overwrite:

@@ -59,7 +59,12 @@ def view(
     with one_sentence("the viewer is closed"):
         width, height = parse_size(size)
         from warp_psf.viewer import Look, open_viewer
+        from warp_psf.viewer.panel import LARGEST_EXPOSURE
 
+        if not abs(exposure) <= LARGEST_EXPOSURE:
+            raise ValueError(f"--exposure {exposure} must be within {LARGEST_EXPOSURE:g} stops of 0")
+        if not host:
+            raise ValueError("--host is empty, which every address would be; leave it out to be heard by this machine")
         seen = read_simulation(source, keyframe)
         if environment is not None:
             seen = seen._replace(environment=None if environment == NO_ENVIRONMENT else environment)
@@ -116,12 +121,25 @@ def read_simulation(source: str, keyframe: str | None) -> Simulation:
     missing = [name for name in ("build", "states") if not callable(names.get(name))]
     if missing:
         raise ValueError(f"{source} has no {' and no '.join(missing)}; give it build() and states(model, fps)")
+    values = [name for name in ("environment", "lights") if name in names and not callable(names[name])]
+    if values:
+        raise ValueError(f"{source}: {' and '.join(values)} must be functions without arguments; make them such")
     light = {name: names[name]() for name in ("environment", "lights") if name in names}
-    return Simulation(names["build"](), names["states"], **light)
+    model = names["build"]()
+    if not hasattr(model, "ncam"):
+        raise ValueError(f"{source}: build() returned a {type(model).__name__}; let it return a mujoco.MjModel")
+    return Simulation(model, names["states"], **light)
 
 
 def _run(source: str) -> dict[str, Any]:
     """What a simulation's file or module defines: a program that the person runs, as `python -m` would."""
+    try:
+        return _run_named(source)
+    except SyntaxError as error:
+        raise ValueError(f"simulation {source} is no Python program: {error}") from error
+
+
+def _run_named(source: str) -> dict[str, Any]:
     path = Path(source)
     if path.suffix == ".py":
         if not path.is_file():

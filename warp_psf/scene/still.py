@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -43,6 +44,11 @@ class StillScene:
         """The lowest and the highest corner, metres, float32 [3] each."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
+    @property
+    def checksum(self) -> int:
+        """Of its triangles: what was made of a scene is of no use for another."""
+        return zlib.crc32(self.faces, zlib.crc32(self.vertices))
+
 
 @dataclass(frozen=True, eq=False)
 class Piece:
@@ -57,13 +63,21 @@ class Piece:
 def make_still(vertices, faces, albedo=(0.8, 0.8, 0.8), cameras: Sequence[Camera] = ()) -> StillScene:
     """A still scene of bare triangles.
 
-    vertices: world positions, metres, [V, 3]. faces: vertex indices, [F, 3]. albedo: linear, [3]. cameras: viewpoints.
+    vertices: world positions, metres, [V, 3]. faces: vertex indices, [F, 3]. albedo: linear, 3 numbers from 0 to 1.
+    cameras: viewpoints.
 
     Raises:
         ValueError: an array has another shape, names a vertex that there is not, or holds what is no number.
+        TypeError: `cameras` is no list of cameras.
     """
+    try:
+        shown = np.asarray(albedo, np.float64)
+    except (TypeError, ValueError):
+        shown = np.empty(0)
+    if shown.shape != (3,) or not ((shown >= 0.0) & (shown <= 1.0)).all():
+        raise ValueError(f"albedo of the still scene is {albedo!r}; give 3 numbers from 0 to 1")
     mesh = make_mesh("still scene", vertices, faces)
-    shown = np.broadcast_to(np.asarray(albedo, np.float32), mesh.faces.shape)
+    shown = np.broadcast_to(shown, mesh.faces.shape)
     return join_pieces([Piece(mesh.vertices, mesh.normals, mesh.faces, shown)], cameras)
 
 
@@ -72,9 +86,12 @@ def join_pieces(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> StillScen
 
     Raises:
         ValueError: there is no triangle in any of them.
+        TypeError: `cameras` is no list of cameras.
     """
     if not any(len(piece.faces) for piece in pieces):
         raise ValueError("the scene has no triangles; give it at least one body that is drawn")
+    if not isinstance(cameras, Sequence) or not all(isinstance(camera, Camera) for camera in cameras):
+        raise TypeError("cameras of a still scene must be a list of Camera; give one such as [camera], or leave it out")
     surface, flat, first_vertex = [], [], 0
     faces = []
     for piece in pieces:
