@@ -3,7 +3,9 @@
 Milliseconds per frame, for direct light, for bounced light and per stage, nanoseconds per receiver and occluder, and
 the bytes of the baked fields, for bowling, falling, statues and room (and teapots, figure, cloth and chess, where
 `--scenes` names them), at 640x360 and 1280x720, shaded at pixels and at vertices. The light is that of the studio
-environment; `--lights` takes each scene's own environment and area lights, which closed rooms have in any case. In
+environment; `--lights` takes each scene's own environment and area lights, which closed rooms have in any case. Where
+there are no area lights, the last gather of the bounces brings the environment's light along, and direct light is what
+is left: the lattice and point lights. In
 every measured frame the bodies have moved, so that nothing is kept from the frame before. Every configuration runs in a
 process of its own, so that its peak memory is its own.
 """
@@ -29,7 +31,7 @@ SHADINGS = ("pixel", "vertex")
 MOMENTS = {"bowling": 1.2, "falling": 1.5, "statues": 1.0, "room": 1.0, "teapots": 1.0}
 MOMENTS |= {"figure": 1.0, "cloth": 1.5, "chess": 1.0}
 # What the Renderer's stages are for; the others (primary visibility, display, ...) belong to neither.
-DIRECT = ("shadow fields", "shadow rays")
+DIRECT = ("shadow fields", "sharp light", "lattice", "shadow rays")
 BOUNCES = ("basis irradiances", "light on proxies", "bounces", "last gather")
 
 
