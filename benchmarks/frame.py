@@ -82,12 +82,12 @@ def measure(scene_name: str, size: str, shading: str, options: argparse.Namespac
         "frame": statistics.median(frames),
         "direct": direct,
         "bounces": bounces,
-        "ratio": bounces / direct,
+        "ratio": bounces / max(direct, 1e-9),
         "stages": per_stage,
         "receivers": receivers,
         "occluders": occluders,
         "field_bytes": field_bytes,
-        "ns_per_receiver_and_occluder": 1e9 * per_stage["shadow fields"] / max(receivers * occluders, 1),
+        "ns_per_receiver_and_occluder": 1e9 * per_stage.get("shadow fields", 0.0) / max(receivers * occluders, 1),
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
 
@@ -138,7 +138,7 @@ def main() -> None:
         print(json.dumps(measure(*options.only, options)))
         return
     rows = []
-    print("ns: of the stage `shadow fields`, on all cores together, per receiver and occluder; the rest in ms")
+    print("ns: of the stage `shadow fields`, if any, on all cores together, per receiver and occluder; the rest in ms")
     print(f"direct: {' + '.join(DIRECT)}; bounces: {' + '.join(BOUNCES)}; ratio: of bounces to direct")
     for scene in options.scenes:
         for size in options.sizes:
