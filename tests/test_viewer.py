@@ -489,3 +489,8 @@ def test_two_pages_see_the_same_state(model, browser, page):
         page.get_by_role("button", name="Step").click()
         wait_until(page, lambda: viewer.session.data.time > 0.0 and is_at_rest(viewer.session), "a step")
         assert page.complaints == [] and math.isfinite(viewer.session.data.time)
+
+
+def test_a_simulation_without_states_is_refused(model):
+    with pytest.raises(ValueError, match="no state to show"):
+        open_viewer(model, lambda model, rate: iter(()), port=0)

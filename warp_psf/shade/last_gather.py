@@ -89,7 +89,7 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
                 corners, weights = cell_of(world, slot, pixel, spacing, probes, receivers)
                 total = weights[0] + weights[1] + weights[2] + weights[3]
                 spacing = 2 * spacing
-        by_probes = sky.shape[0] > 0
+        has_sky = sky.shape[0] > 0
         diffuse = wp.vec3()
         glossy = wp.vec3()
         from_sky = wp.vec3()
@@ -98,11 +98,11 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             if corners[place] >= 0:
                 share = weights[place] / total
                 diffuse += share * irradiance_of(light, corners[place], response)
-                if by_probes:
+                if has_sky:
                     from_sky += share * irradiance_of(sky, corners[place], response)
                 if is_glossy:
                     glossy += share * irradiance_of(light, corners[place], shine)
-                    if by_probes:
+                    if has_sky:
                         glossy_from_sky += share * irradiance_of(sky, corners[place], shine)
         if own_first[entity] >= 0:
             corner = surface.corners + wp.vec3i(own_first[entity])
@@ -118,7 +118,7 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
             glossy_from_sky = from_sky / wp.pi
         diffuse_out[world, slot] = wp.max(diffuse, wp.vec3())
         glossy_out[world, slot] = wp.max(glossy, wp.vec3())
-        if by_probes:
+        if has_sky:
             sky_diffuse_out[world, slot] = wp.max(from_sky, wp.vec3())
             sky_glossy_out[world, slot] = wp.max(glossy_from_sky, wp.vec3())
 

@@ -51,7 +51,9 @@ def open_viewer(
         ValueError, OSError: an option, the model, the host or the port cannot be used, in one sentence.
     """
     check_free(host, port)
-    first = next(states(model, frames_per_second))
+    first = next(states(model, frames_per_second), None)
+    if first is None:
+        raise ValueError("the simulation has no state to show; let its states() yield at least one")
     viewpoints = find_viewpoints(model, first, camera)
     if slab is None:
         settings |= {"lights": lights, "device": device}
