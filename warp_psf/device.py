@@ -6,7 +6,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 
@@ -14,7 +14,7 @@ import warp as wp
 
 # Each core gets this many pieces of a launch, so that a core with cheap pieces can take over another's.
 PIECES_PER_CORE = 8
-# A piece smaller than this costs more to hand over (about 40 microseconds) than it saves.
+# A piece smaller than this costs more to hand over (about 10 microseconds) than it saves.
 SMALLEST_PIECE = 64
 
 
@@ -37,8 +37,9 @@ def find_device(name: str | None = None) -> wp.Device:
 def launch(kernel, dim: tuple[int, int], inputs: Sequence, outputs: Sequence, device: wp.Device) -> None:
     """Runs `kernel` over `dim` = (worlds, items), on every core of a CPU or as one launch on CUDA.
 
-    A CPU launch runs on one core and releases the interpreter's lock, so the items are cut into pieces that threads
-    launch side by side. Every kernel's first parameter is therefore `first`, the item at which its piece begins:
+    A CPU launch runs on one core and releases the interpreter's lock, so the items are cut into pieces, and the caller
+    and a thread for each other core launch one after another until none is left. Every kernel's first parameter is
+    therefore `first`, the item at which its piece begins:
 
         world, item = wp.tid()
         item += first
@@ -46,22 +47,32 @@ def launch(kernel, dim: tuple[int, int], inputs: Sequence, outputs: Sequence, de
     worlds, items = dim
     if worlds == 0 or items == 0:
         return
-    arguments = [*inputs, *outputs]
-    if device.is_cuda:
-        wp.launch(kernel, dim=dim, inputs=[0, *arguments], device=device)
-        return
+    arguments = [0, *inputs, *outputs]
     pieces = min(core_count() * PIECES_PER_CORE, max(1, items // SMALLEST_PIECE))
-    bounds = [items * piece // pieces for piece in range(pieces + 1)]
-    if pieces == 1:
-        wp.launch(kernel, dim=dim, inputs=[0, *arguments], device=device)
+    if device.is_cuda or pieces == 1:
+        wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_tape=False)
         return
     wp.load_module(kernel.module, device=device, block_dim=1)
+    left = iter(range(pieces))
 
-    def launch_piece(first: int, last: int) -> None:
-        wp.launch(kernel, dim=(worlds, last - first), inputs=[first, *arguments], device=device, record_tape=False)
+    def launch_pieces() -> None:
+        # The arguments are packed once for all pieces of a core.
+        command = wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_cmd=True)
+        for piece in left:
+            first, end = items * piece // pieces, items * (piece + 1) // pieces
+            command.set_dim((worlds, end - first))
+            command.set_param_at_index(0, first)
+            command.launch()
 
-    # list() waits for every piece and raises the first error of any.
-    list(_workers().map(launch_piece, bounds[:-1], bounds[1:]))
+    others = [_workers().submit(launch_pieces) for _ in range(min(core_count(), pieces) - 1)]
+    try:
+        launch_pieces()
+    finally:
+        # Who has not begun finds nothing left.
+        begun = [other for other in others if not other.cancel()]
+        wait(begun)
+    for other in begun:
+        other.result()
 
 
 def upload_tables(tables: Sequence, dtype: type, device: wp.Device) -> wp.array:
