@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.shade.penumbra import slab_distance
+from warp_psf.shade.penumbra import box_outline, outline_distance
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -17,7 +17,7 @@ def _distances_to_slab(
 ):
     _, item = wp.tid()
     item += first
-    distance_out[item] = slab_distance(directions[item], points[item], half)
+    distance_out[item] = outline_distance(box_outline(points[item], half), directions[item])
 
 
 def _meets_box(directions: np.ndarray, points: np.ndarray, half: np.ndarray) -> np.ndarray:

@@ -19,7 +19,16 @@ from warp_psf.shade.coverage import FIELD_SHAPE, SLAB_SHAPE, SPHERE_SHAPE
 from warp_psf.shade.delta import SHADOW_OFFSET, bulb_point
 from warp_psf.shade.fades import Light, horizon_fade
 from warp_psf.shade.occlude import SLAB_HORIZON, make_occlude
-from warp_psf.shade.penumbra import PART_RADIUS, PARTS, disc_share, part_direction, slab_distance, sphere_distance
+from warp_psf.shade.penumbra import (
+    PART_RADIUS,
+    PARTS,
+    BoxOutline,
+    box_outline,
+    disc_share,
+    outline_distance,
+    part_direction,
+    sphere_distance,
+)
 from warp_psf.shade.sources import Group, SharpTables, source_of
 
 # Nearer to a body's centre than this many bounding radii its surface may be so near that samples of its field are far
@@ -87,8 +96,7 @@ def make_hiding(order: int) -> SimpleNamespace:
         offset: wp.vec3,
         radius: float,
         to_frame: wp.mat33,
-        at: wp.vec3,
-        half: wp.vec3,
+        outline: BoxOutline,
         seen: Silhouette,
         s: SharpTables,
     ) -> float:
@@ -96,7 +104,7 @@ def make_hiding(order: int) -> SimpleNamespace:
         if shape == wp.static(SPHERE_SHAPE):
             return sphere_distance(toward, offset, radius)
         if shape == wp.static(SLAB_SHAPE):
-            return slab_distance(to_frame * toward, at, half)
+            return outline_distance(outline, to_frame * toward)
         return silhouette_distance(s[0].silhouettes, seen, to_frame * toward)
 
     @wp.func
@@ -119,12 +127,12 @@ def make_hiding(order: int) -> SimpleNamespace:
         offset = placed.center - p
         to_frame = wp.transpose(placed.rotation)
         at = to_frame * (p - placed.position)
-        half = wp.vec3()
+        outline = BoxOutline()
         if shape == wp.static(SLAB_SHAPE):
             to_slab = wp.transpose(placed.rotation * o[0].occluders.slab_rotation[entity])
             at = to_slab * (p - placed.position - placed.rotation * o[0].occluders.slab_center[entity])
             to_frame = to_slab
-            half = o[0].occluders.slab_half[entity]
+            outline = box_outline(at, o[0].occluders.slab_half[entity])
         seen = Silhouette()
         if shape == wp.static(FIELD_SHAPE):
             seen = find_silhouette(s[0].silhouettes, s[0].field[entity], at)
@@ -149,7 +157,7 @@ def make_hiding(order: int) -> SimpleNamespace:
                 origin = wp.transpose(placed.rotation) * (origin - placed.position)
                 covered = ray_share(mesh, origin, to_frame * direction, radius, placed.radius)
             else:
-                distance = distance_to(direction, shape, offset, placed.radius, to_frame, at, half, seen, s)
+                distance = distance_to(direction, shape, offset, placed.radius, to_frame, outline, seen, s)
                 if source < 0:
                     if distance <= -radius - error:
                         return visible
@@ -165,7 +173,7 @@ def make_hiding(order: int) -> SimpleNamespace:
                     parts = int(wp.static(PARTS))
                     for part in range(parts):
                         toward = part_direction(direction, radius, part)
-                        aside = distance_to(toward, shape, offset, placed.radius, to_frame, at, half, seen, s)
+                        aside = distance_to(toward, shape, offset, placed.radius, to_frame, outline, seen, s)
                         covered += wp.static(1.0 / PARTS) * disc_share(aside, wp.static(PART_RADIUS) * radius)
             if source >= 0:
                 result[source] = result[source] * (1.0 - weight * covered)

@@ -7,6 +7,8 @@ PARTS = 4
 # Their centres lie at this share of the source's radius from its middle, and they are half as wide: together they
 # spread as the source does, (1/2)^2 / 4 + 0.612^2 / 2 = 1 / 4.
 PART_PLACE, PART_RADIUS = 0.6124, 0.5
+# A box seen from outside has no more edges in its silhouette.
+six_normals = wp.types.matrix(shape=(6, 3), dtype=wp.float32)
 
 
 @wp.func
@@ -36,15 +38,18 @@ def sphere_distance(direction: wp.vec3, offset: wp.vec3, radius: float) -> float
     return wp.asin(wp.min(radius / distance, 1.0)) - apart
 
 
-@wp.func
-def slab_distance(direction: wp.vec3, p: wp.vec3, half: wp.vec3) -> float:
-    """The angle from a direction to the silhouette of a box about the origin, seen from p, above zero within it.
+@wp.struct
+class BoxOutline:
+    """The silhouette of a box from one point, in the box's frame: a convex cone between planes through that point."""
 
-    All in the box's frame. The silhouette is convex: within it the nearest of its edges counts, and outside it the one
-    that is furthest before the direction.
-    """
-    nearest = float(1.0)
-    found = bool(False)
+    inward: six_normals  # unit normals of the planes, to the box's side
+    count: wp.int32  # of the planes; 0 from inside the box
+
+
+@wp.func
+def box_outline(p: wp.vec3, half: wp.vec3) -> BoxOutline:
+    """The outline of a box about the origin seen from p, both in the box's frame."""
+    outline = BoxOutline()
     edges = int(12)  # a variable keeps the loop from being unrolled
     for edge in range(edges):
         axis = edge / 4
@@ -52,6 +57,7 @@ def slab_distance(direction: wp.vec3, p: wp.vec3, half: wp.vec3) -> float:
         v = (axis + 2) % 3
         side_u = wp.where(edge % 2 == 0, -1.0, 1.0)
         side_v = wp.where(edge % 4 < 2, -1.0, 1.0)
+        # Of the faces beside an edge of the silhouette one is seen.
         if (side_u * p[u] > half[u]) != (side_v * p[v] > half[v]):
             start = wp.vec3()
             start[u] = side_u * half[u] - p[u]
@@ -59,13 +65,20 @@ def slab_distance(direction: wp.vec3, p: wp.vec3, half: wp.vec3) -> float:
             start[axis] = -p[axis]
             along = wp.vec3()
             along[axis] = 1.0
-            across = wp.normalize(wp.cross(start, along))
-            # Its sign so that the box lies on the positive side.
-            if wp.dot(across, -p) < 0.0:
-                across = -across
-            nearest = wp.min(nearest, wp.dot(across, direction))
-            found = True
-    if not found:
-        # From inside everything is covered.
-        return wp.static(1.0)
-    return wp.asin(wp.clamp(nearest, -1.0, 1.0))
+            inward = wp.normalize(wp.cross(start, along))
+            outline.inward[outline.count] = wp.where(wp.dot(inward, p) > 0.0, -inward, inward)
+            outline.count += 1
+    return outline
+
+
+@wp.func
+def outline_distance(outline: BoxOutline, direction: wp.vec3) -> float:
+    """The angle from a direction of the box's frame to its silhouette, above zero within it.
+
+    Within it the nearest of its edges counts, and outside it the one that is furthest before the direction.
+    """
+    nearest = float(1.0)
+    for plane in range(outline.count):
+        nearest = wp.min(nearest, wp.dot(outline.inward[plane], direction))
+    # From inside everything is covered.
+    return wp.where(outline.count == 0, 1.0, wp.asin(wp.clamp(nearest, -1.0, 1.0)))
