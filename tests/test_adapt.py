@@ -156,7 +156,7 @@ def test_nothing_is_interpolated_between_inside_and_outside():
     inside[:20] = True
     shell = np.where(inside[..., None], 0.004, 0.0).astype(np.float32) * np.ones(16, np.float32)
     found, cast = filled(shell, inside)
-    # Outside it is exactly nothing; inside the weights add up to one but for the last bit, which processors round apart.
+    # Nothing at all outside; inside the weights add up to one but for the last bit, which processors round apart.
     np.testing.assert_allclose(found, shell, rtol=1e-6, atol=0.0)
     assert cast[17:23].all()
     assert not cast[40:].all()
