@@ -1,4 +1,29 @@
-"""Soft shadows and interreflection for MuJoCo simulations, frame after frame, on Warp kernels."""
+"""Soft shadows and interreflection for MuJoCo simulations, frame after frame, on Warp kernels.
+
+```python
+import mujoco
+import warp_psf as psf
+
+model = mujoco.MjModel.from_xml_path("model.xml")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with psf.Renderer(model, height=240, width=320) as renderer:
+    renderer.update_scene(data, camera="front")
+    rgb = renderer.render()  # uint8 [240, 320, 3]
+```
+
+Examples further down take `psf` for this package, `np` for numpy, and `model` and `data` for a MuJoCo model and its
+state. Lengths are metres, angles radians, axes right-handed with z up. Colours and radiance are linear Rec.709, three
+numbers each; a white matt surface under an even radiance of 1 has the radiance 1. Arrays have the shape in brackets.
+
+- Pictures: `Renderer`.
+- Light: `rectangle_light`, `sphere_light`, `AreaLight`, `DeltaLight`, `load_environment`, `Environment`.
+- Shapes: `load_mesh`, `make_mesh`, `Mesh`.
+- Files: `FrameSequence`, `to_display`, `read_exr`, `image_difference`.
+- What is precomputed of a shape, for those who study it; a renderer bakes by itself: `bake_mesh`, `BakedBody`,
+  `bake_silhouettes`, `bake_wavelet_fields`.
+- Scenes at rest, in which only the light or the viewpoint moves: `freeze_scene`, `area_light`.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -51,33 +51,40 @@ DIRECTIONAL_REACH = 1000.0
 class Renderer:
     """Renders a MuJoCo model with soft shadows, frame after frame, without noise.
 
-        with warp_psf.Renderer(model, 360, 640) as renderer:
+    ```python
+    lamp = psf.rectangle_light("lamp", 1.0, 0.6, radiance=(8, 7, 6), position=(0, -1, 2), target=(0, 0, 0))
+    with psf.Renderer(model, height=120, width=160, environment="sky", lights=[lamp], bounces=2) as renderer:
+        for _ in range(3):
+            mujoco.mj_step(model, data)
             renderer.update_scene(data, camera="front")
-            rgb = renderer.render()
+            rgb, layers = renderer.render(), renderer.layers()
+    ```
 
-    model: the compiled model; edges are antialiased unless its `visual/quality` says offsamples below 2. height, width:
-        of the picture, pixels.
-    max_geom: how many geoms `scene` has room for.
-    environment: light from all around: a built-in name ("studio", "sky", "sunset", "overcast"), the path of an EXR or
-        HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None for none. A model's lights of
-        type `image` add theirs; its skybox, if it has one, is seen in the background, and lights nothing.
-    lights: area lights (`AreaLight`, `rectangle_light`) in addition to the model's own lights.
-    bounces: how often light is passed on between the bodies, 0 to 16; 0 leaves only direct light.
-    bounce_threshold: a body that takes up a smaller share of a point's view than this sends it no bounced light.
-    basis_functions: how many functions per body stand for the light that leaves it: 4, 8, 16 or 32.
-    order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
-    basis: "sh" shows all light in spherical harmonics; "haar" shows what is small and bright in it, suns, windows and
-        area lights, at full frequency, with sharp-edged shadows.
-    compose: how what bodies leave of the light is combined: "product" multiplies their visibilities, "log" adds their
-        logarithms and exponentiates the sum. See the README for which is better when.
-    shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
-        planes are cut finely enough for that; other meshes show what their vertices resolve, and open ones the light of
-        their front on both sides.
-    material_space: whether MJCF's rgba is "srgb" or "linear".
-    model_lights: False leaves out the model's own lights and headlight.
-    exposure, view: how `render` develops the picture: stops, and a view transform, "neutral" or "srgb".
-    device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
-    progress: called as progress(what, share) while shadow fields are baked, which happens once per shape and is cached.
+    Args:
+        model: the compiled model; edges are antialiased unless its `visual/quality` says offsamples below 2.
+        height, width: of the picture, pixels.
+        max_geom: how many geoms `scene` has room for.
+        environment: light from all around, as `load_environment` takes it: "studio", "sky", "sunset", "overcast", the
+            path of an EXR or HDR file, radiance as a float array [rows, columns, 3], an `Environment`, or None. A
+            model's lights of type `image` add theirs; its skybox is seen in the background, and lights nothing.
+        lights: a list of lights besides the model's own: `rectangle_light`, `sphere_light`, `AreaLight`, `DeltaLight`.
+        order: bands of spherical harmonics, 2 to 6. Shadows sharpen and cost grows with the order.
+        basis: "sh" shows all light in spherical harmonics; "haar" shows what is small and bright in it, suns, windows
+            and area lights, at full frequency, with sharp-edged shadows.
+        compose: how what bodies leave of the light is combined: "product" multiplies their visibilities, "log" adds
+            their logarithms and exponentiates the sum. See the README for which is better when.
+        bounces: how often light is passed on between the bodies, 0 to 16; 0 leaves only direct light.
+        bounce_threshold: a body sends no bounced light to points where its (radius / distance)^2 is below this, a share
+            between 0 and 1, unless it is flat.
+        basis_functions: how many functions per body stand for the light that leaves it: 4, 8, 16 or 32.
+        shading: "pixel" shades what each pixel sees; "vertex" shades vertices, once each, and interpolates. Boxes and
+            planes are cut finely enough for that; other meshes show what their vertices resolve, and open ones the
+            light of their front on both sides.
+        material_space: whether MJCF's rgba is "srgb" or "linear".
+        model_lights: False leaves out the model's own lights and headlight.
+        exposure, view: how `render` develops the picture: stops, and a view transform; see `to_display`.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
+        progress: called as progress(what, share), a text and 0 to 1, while shapes are baked: once each, then cached.
 
     Raises:
         ValueError: a size, order, name or device is not usable; the message says which and what is.
@@ -163,13 +170,13 @@ class Renderer:
         """MuJoCo's abstract scene of the last `update_scene`.
 
         Geoms that a script adds to it (mjv_initGeom and ngeom + 1, mjv_connector) are drawn by the next `render`, as
-        marks that cast no shadows; other changes of it change nothing.
+        marks that cast no shadows; other changes of it change nothing. `update_scene` makes it anew, without them.
         """
         return self._scene
 
     @property
     def environment(self) -> Environment | None:
-        """The light from all around. It may be set anew at any time, to all that a new renderer takes for it."""
+        """The light from all around, or None; it may be set at any time, to all that a new renderer takes for it."""
         return self._environment
 
     @environment.setter
@@ -181,19 +188,19 @@ class Renderer:
 
     @property
     def world_from_camera(self) -> np.ndarray:
-        """The camera's pose as of the last `update_scene`, float64 [4, 4]; it looks along its -z."""
+        """The camera's pose as of the last `update_scene`, float64 [4, 4]; it looks along its -z, +y is up."""
         if self._world_from_camera is None:
             raise RuntimeError("there is no camera yet; call update_scene(data, camera) first")
         return self._world_from_camera
 
     @property
     def stage_seconds(self) -> dict[str, float]:
-        """How long each stage of the last frame took, seconds, in order."""
+        """How long each stage of the last frame took, seconds, by name, in order; empty before the first one."""
         return dict(self._stage.seconds)
 
     @property
     def occluders(self) -> int:
-        """How many entities cast shadows."""
+        """How many bodies cast shadows: opaque meshes that lie together on one body of MuJoCo's are one."""
         return sum(entity.casts for entity in self._stage.scene.entities)
 
     @property
@@ -203,7 +210,7 @@ class Renderer:
 
     @property
     def vertices(self) -> int:
-        """How many vertices all entities have together."""
+        """How many vertices all bodies have together, after boxes and planes are cut finely."""
         return sum(len(self._stage.scene.meshes[entity.mesh].vertices) for entity in self._stage.scene.entities)
 
     def update_scene(
@@ -214,14 +221,17 @@ class Renderer:
     ) -> None:
         """Takes over the state that the next `render` shows.
 
-        camera: a camera's id or name, -1 for the free camera, or an `MjvCamera`. scene_option: what is drawn: groups of
-        geoms and sites, textures, transparency; MuJoCo's defaults without. Where it shows other geoms than before, and
-        where the model's own sizes or colours have changed, the scene is set up anew, which takes about as long as a
-        new renderer.
+        Args:
+            data: the state, brought up to date by mj_step or mj_forward.
+            camera: a camera's id or name, -1 for the free camera, or an `MjvCamera`.
+            scene_option: what is drawn: groups of geoms and sites, textures, transparency; MuJoCo's defaults without.
+                Where it shows other geoms than before, and where the model's own sizes or colours have changed, the
+                scene is set up anew, which takes about as long as a new renderer.
 
         Raises:
             ValueError: there is no such camera, or `data` is of another model.
-            TypeError: `scene_option` is no MjvOption.
+            TypeError: an argument is of another type.
+            RuntimeError: the renderer is closed.
         """
         stage = self._stage
         view = read_camera(self._model, data, camera)
@@ -244,12 +254,16 @@ class Renderer:
     def learn_motion(self, states: Iterable[mujoco.MjData]) -> None:
         """Finds out what skins and flexes see of themselves in a recorded motion, so that motion like it costs less.
 
-        states: of the motion; the same `MjData` may come every time, moved on. Where a body later bends as it never did
-        in them, it may lack some of its own shadow. What was learned holds until other geoms are shown, or the model's
-        sizes or colours change. Source: Kautz 2004, section 3.2, potentially visible sets.
+        Where a body later bends as it never did in them, it may lack some of its own shadow. What was learned holds
+        until other geoms are shown, or the model's sizes or colours change. Source: Kautz 2004, section 3.2,
+        potentially visible sets.
+
+        Args:
+            states: of the motion; the same `MjData` may come every time, moved on.
 
         Raises:
             ValueError: there are no states, or one is of another model.
+            RuntimeError: the renderer is closed.
         """
         stage, view = self._stage, mujoco.MjvScene(self._model, self._scene.maxgeom)
         motion = []
@@ -265,9 +279,12 @@ class Renderer:
     def render(self, *, out: np.ndarray | None = None) -> np.ndarray:
         """The picture of the last `update_scene`.
 
-        Returns uint8 [height, width, 3], ready to be shown; with depth rendering on, float32 [height, width], metres;
-        with segmentation rendering on, int32 [height, width, 2], object ids and types. `out` receives it if given, cast
-        to its type as MuJoCo's renderer does.
+        Args:
+            out: an array that receives it, cast to its type as MuJoCo's renderer does, and is returned.
+
+        Returns:
+            uint8 [height, width, 3], sRGB; with depth rendering on, float32 [height, width], metres, at most the far
+            clipping plane; with segmentation rendering on, int32 [height, width, 2], object ids and types.
 
         Raises:
             RuntimeError: `update_scene` was not called, or the renderer is closed.
@@ -295,15 +312,19 @@ class Renderer:
     def layers(self) -> dict[str, np.ndarray]:
         """The layers of the last `update_scene`, as arrays of their own.
 
-        `color`: radiance with background and luminous surfaces; `direct`: what lights and environment cause by one
-        reflection; `indirect`: what came by other bodies; `albedo`; `normal` in the world: all float32 [height, width,
-        3], scene-linear. `depth`: metres along the optical axis, infinite where nothing is, float32 [height, width].
-        `segmentation`: object id and type, -1 where nothing is, int32 [height, width, 2].
+        - `color`, radiance with background and luminous surfaces; `direct`, what lights and environment cause by one
+          reflection; `indirect`, what came by other bodies; `albedo`; `normal`, in the world: float32 [height, width,
+          3], linear, before `exposure` and `view`.
+        - `depth`: metres along the optical axis, infinite where nothing is, float32 [height, width].
+        - `segmentation`: MuJoCo's object id and type, -1 where nothing is, int32 [height, width, 2].
+
+        Raises:
+            RuntimeError: `update_scene` was not called, or the renderer is closed.
         """
         return read_layers(self._draw().film)
 
     def enable_depth_rendering(self) -> None:
-        """From now on `render` returns depth."""
+        """From now on `render` returns depth, in place of pictures or segmentation."""
         self._depth_rendering, self._segmentation_rendering = True, False
 
     def disable_depth_rendering(self) -> None:
@@ -311,7 +332,7 @@ class Renderer:
         self._depth_rendering = False
 
     def enable_segmentation_rendering(self) -> None:
-        """From now on `render` returns object ids and types."""
+        """From now on `render` returns object ids and types, in place of pictures or depth."""
         self._depth_rendering, self._segmentation_rendering = False, True
 
     def disable_segmentation_rendering(self) -> None:
@@ -319,7 +340,7 @@ class Renderer:
         self._segmentation_rendering = False
 
     def close(self) -> None:
-        """Gives back the device's memory. A closed renderer renders no more; closing twice is no error."""
+        """Gives back the device's memory, as the end of a `with` block does; closing twice is no error."""
         self._standing = None
 
     def __enter__(self) -> Renderer:

@@ -39,14 +39,27 @@ def next_states(states: np.ndarray, active: np.ndarray) -> np.ndarray:
 class SlabView:
     """A viewpoint of a still scene under the lights of shadow slabs, which shine as their templates say.
 
-        view = SlabView(scene_map, [slab])
-        view.set_light(0, template)
-        picture = view.picture()
+    All lights are off to begin with.
 
-    scene_map: of the viewpoint. slabs: one per light.
+    ```python
+    A = psf.area_light
+    scene = psf.freeze_scene(model, data, cameras=["front"])
+    lamp = psf.rectangle_light("lamp", 1.0, 1.0, radiance=(1, 1, 1), position=(0, 0, 2), target=(0, 0, 0))
+    slab = A.bake_shadow_slab(scene, A.make_light_plane(lamp, rows=5, columns=5), size=65)
+    view = A.SlabView(A.bake_scene_map(scene, width=160, height=120), [slab])
+    pictures = []
+    for x in (-0.4, 0.0, 0.4):
+        view.set_light(0, 30.0 * A.templates.square(5, 5, side=0.5, at=(x, 0.0)))
+        pictures.append(view.picture())
+    ```
+
+    Args:
+        scene_map: of the viewpoint.
+        slabs: one per light, of the scene map's scene.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
 
     Raises:
-        ValueError: there is no slab, or one is of another scene.
+        ValueError: there is no slab, one is of another scene, or there is no such device.
         TypeError: one of them is something else.
     """
 
@@ -71,12 +84,16 @@ class SlabView:
     def set_light(self, light: int, template) -> int:
         """Lets the samples of a light shine, and returns how many of them were asked because they changed.
 
-        light: the slab's place. template: radiance of each sample, linear, W/(m^2 sr), [rows, columns] or [rows,
-        columns, 3]; 0 is off.
+        A sample that is switched on and off again leaves every pixel as it was, to the bit.
+
+        Args:
+            light: the slab's place, counted from 0.
+            template: radiance of each sample, linear, [rows, columns] or [rows, columns, 3], at most 1e8; 0 is off. Row
+                0 is the plane's uppermost one. The functions of `area_light.templates` make shapes.
 
         Raises:
             IndexError: there is no such light.
-            ValueError: the template has another shape, or a radiance is negative or no number.
+            ValueError: the template has another shape, or a radiance is negative, too large or no number.
         """
         self._check_light(light)
         old = self._templates[light]
@@ -99,7 +116,11 @@ class SlabView:
         return self._templates[light].copy()
 
     def states(self, light: int) -> np.ndarray:
-        """The differential map of a light after the last change, int8 [rows, columns]: states 1 to 4 of the thesis."""
+        """The differential map of a light after the last change, int8 [rows, columns].
+
+        1: the sample never shone, or is off as before; 2: it was switched on; 3: it stays on; 4: it was switched off.
+        Source: Jeng 2005, section 3.4.2.
+        """
         self._check_light(light)
         return self._states[light].copy()
 

@@ -52,16 +52,21 @@ class FrameTable:
 
 @dataclass(frozen=True, eq=False)
 class LayeredMap:
-    """A layered area light map. Built by `bake_layered_map`.
+    """A layered area light map: points of surfaces, and how much of a light each receives. Built by `bake_layered_map`.
 
-    light: points on the light that shadows were asked of. unshadowed: those over which its light is summed.
-    radiance: of the light, float64 [3].
-    origin: the base point, metres. rotation: world_from_face, float64 [faces, 3, 3]. middle, half: which part of the
-        half space's square, from -1 to 1, the map is: its middle [2] and half its side. size: cells along it.
-    first: where each cell's elements begin, int32 [cells + 1]; a face's cells lie by rows.
-    surface: of each element, int32 [E]. visibility: share of the light that arrives, float32 [E].
-    position, normal: world, float32 [E, 3].
-    scene: checksum of the scene.
+    Attributes:
+        light: points on the light that shadows were asked of.
+        unshadowed: points on the light over which its light is summed.
+        radiance: of the light, float64 [3].
+        origin: the base point, from which the map looks, world, metres, float64 [3].
+        rotation: world_from_face, float64 [faces, 3, 3].
+        middle, half: which part of the half space's square, from -1 to 1, the map is: its middle [2] and half its side.
+        size: cells along it.
+        first: where each cell's elements begin, int32 [cells + 1]; a face's cells lie by rows.
+        surface: of each element, int32 [E].
+        visibility: share of the light that arrives at each element, float32 [E].
+        position, normal: of each element, world, metres, float32 [E, 3].
+        scene: checksum of the scene.
     """
 
     light: LightSamples
@@ -91,10 +96,15 @@ def bake_layered_map(
 ) -> LayeredMap:
     """Finds surface points from nine reference views, and how much of the light each receives.
 
-    size: cells along a side of the map, and pixels of a reference view. samples: points on the light.
-
     The reference points stand at the light's middle, at the corners of its bounding rectangle, and outside it on the
     diagonals. Source: Jeng 2005, sections 4.2.3 and 4.4.
+
+    Args:
+        scene: what the light shines on.
+        light: of any shape, in the world.
+        size: cells along a side of the map, and pixels of a reference view, 2 to 2048.
+        samples: points on the light that each surface point is asked for, 1 to 4096.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
 
     Raises:
         ValueError: a number is not usable, the light hangs on a body, or nothing of the scene is before it.

@@ -31,16 +31,18 @@ SQUARES_AT_A_TIME = 1 << 21
 class PointLists:
     """Points of triangles, list after list, in groups of one list and one triangle. Built by `sample_points`.
 
-    smallest: side of the last list's squares, metres; each list's are twice as wide as the next one's.
-    origin, axes, normal: of each triangle's plane, world: float64 [T, 3], [T, 2, 3], float64 [T, 3].
-    albedo: of each triangle, linear, float32 [T, 3].
-    sides: of each triangle's sides, inward unit normal and offset in its plane, metres, float64 [T, 3, 3]: (x, y, 1)
-        times them is how far a point lies within the sides.
-    cell: column and row of each point's square on its triangle's grid, in squares of its list, int32 [points, 2].
-    first: of each group, int64 [groups + 1].
-    triangle, level: of each group, int32 [groups]; lists are counted from 0.
-    stands_in: whether a group's points stand for smaller ones, bool [groups].
-    alone: whether a group's point is its triangle's only one, bool [groups].
+    Attributes:
+        smallest: side of the last list's squares, metres; each list's are twice as wide as the next one's.
+        levels: how many lists there are.
+        origin, axes, normal: of each triangle's plane, world, metres: float64 [T, 3], [T, 2, 3] and [T, 3].
+        albedo: of each triangle, linear, float32 [T, 3].
+        sides: of each triangle's sides, inward unit normal and offset in its plane, metres, float64 [T, 3, 3]:
+            (x, y, 1) times them is how far a point lies within the sides.
+        cell: column and row of each point's square on its triangle's grid, in squares of its list, int32 [points, 2].
+        first: where each group's points begin, int64 [groups + 1].
+        triangle, level: of each group, int32 [groups]; lists are counted from 0.
+        stands_in: whether a group's points stand for smaller ones, bool [groups].
+        alone: whether a group's point is its triangle's only one, bool [groups].
     """
 
     smallest: float
@@ -64,16 +66,19 @@ class PointLists:
         return np.bincount(self.level, sizes, self.levels).astype(np.int64)
 
     def size(self, level: int) -> float:
-        """Side of a list's squares, metres."""
+        """Side of a list's squares, metres; lists are counted from 0, the largest squares first."""
         return self.smallest * 2.0 ** (self.levels - 1 - level)
 
 
 def sample_points(scene: StillScene, *, smallest: float | None = None, levels: int = 4) -> PointLists:
     """Samples every triangle of a scene into lists.
 
-    smallest: side of the smallest squares, metres; a thousandth of the scene's extent without. levels: how many lists.
-
     A triangle smaller than the smallest square is one point. Source: Jeng 2005, section 5.2.2.
+
+    Args:
+        scene: the triangles.
+        smallest: side of the smallest squares, metres; a thousandth of the scene's extent without.
+        levels: how many lists, 1 to 6; each list's squares are twice as wide as the next one's.
 
     Raises:
         ValueError: a value is not usable, or there would be more than 100 million points.

@@ -71,7 +71,10 @@ class ScreenTable:
 
 @dataclass(frozen=True, eq=False)
 class DeviceLayers:
-    """A scene and its layered map on the device, for many pictures. Built by `upload_layers`."""
+    """A scene and its layered map on the device, as `project_forward` takes them for many pictures.
+
+    Built by `upload_layers`; what it holds is for the methods alone.
+    """
 
     still: DeviceStill
     frame: FrameTable
@@ -84,8 +87,13 @@ class DeviceLayers:
 
 @dataclass(frozen=True, eq=False)
 class ShadowPicture:
-    """color: radiance, linear, float32 [height, width, 3]. visibility: the share of the light that arrives, 0 where
-    none is sent, float32 [height, width]. surface: of the scene, -1 where nothing is, int32 [height, width]."""
+    """What a camera sees of a scene under one light.
+
+    Attributes:
+        color: radiance, linear, float32 [height, width, 3].
+        visibility: the share of the light that arrives, 0 where none is sent, float32 [height, width].
+        surface: of the scene, -1 where nothing is, int32 [height, width].
+    """
 
     color: np.ndarray
     visibility: np.ndarray
@@ -118,10 +126,8 @@ def upload_layers(layered: LayeredMap, scene: StillScene, device: str | None = N
 def project_forward(layers: DeviceLayers, camera: Camera, width: int, height: int) -> ShadowPicture:
     """Carries the map's points onto the screen, fills holes within surfaces, and smooths within surfaces.
 
-    Source: Jeng 2005, sections 4.3.1 to 4.3.3.
-
-    Raises:
-        ValueError: the picture has no size.
+    `layers` is of `upload_layers`, `camera` any, `width` and `height` are pixels. Source: Jeng 2005, sections 4.3.1 to
+    4.3.3. Raises ValueError where the picture has no size, TypeError where `layers` or `camera` is something else.
     """
     view, screen = _look(layers, camera, width, height)
     device, pixels = layers.device, screen.width * screen.height
@@ -139,10 +145,7 @@ def project_forward(layers: DeviceLayers, camera: Camera, width: int, height: in
 def retrieve_backward(layers: DeviceLayers, camera: Camera, width: int, height: int) -> ShadowPicture:
     """Looks each pixel's point up in the map: the element of its surface in its cell, or in one beside it.
 
-    This is how a layered attenuation map is read (Agrawala 2000), for comparison.
-
-    Raises:
-        ValueError: the picture has no size.
+    This is how a layered attenuation map is read (Agrawala 2000), for comparison; takes what `project_forward` takes.
     """
     _, screen = _look(layers, camera, width, height)
     shape = (1, screen.width * screen.height)
@@ -153,11 +156,7 @@ def retrieve_backward(layers: DeviceLayers, camera: Camera, width: int, height: 
 
 
 def trace_view(layers: DeviceLayers, camera: Camera, width: int, height: int) -> ShadowPicture:
-    """Asks every sample of the light with a ray from every pixel: the reference.
-
-    Raises:
-        ValueError: the picture has no size.
-    """
+    """Asks every sample of the light with a ray from every pixel: the reference; takes what `project_forward` takes."""
     _, screen = _look(layers, camera, width, height)
     shape = (1, screen.width * screen.height)
     visibility = wp.zeros(shape, dtype=wp.float32, device=layers.device)

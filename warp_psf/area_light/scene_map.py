@@ -33,12 +33,15 @@ NEAREST = wp.constant(1.0e-9)
 
 @dataclass(frozen=True, eq=False)
 class SceneMap:
-    """What a camera sees in a picture of width x height pixels. Built by `bake_scene_map`.
+    """What a camera sees in a picture of width x height pixels, adaptively sampled. Built by `bake_scene_map`.
 
-    flat: whether each surface of the scene is a plane, bool [surfaces].
-    maps: one map whose samples lie at pixels' centres, of (inverse depth 1/m, or depth for an orthographic camera,
-        float32; surface, int32, -1 where nothing is; smooth normal, float32 [3]; albedo, float32 [3]).
-    scene: checksum of the scene.
+    Attributes:
+        camera: the viewpoint.
+        width, height: of the picture, pixels.
+        flat: whether each surface of the scene is a plane, bool [surfaces].
+        maps: a quad-tree whose samples lie at pixels' centres, of (inverse depth 1/m, or depth for an orthographic
+            camera, float32; surface, int32, -1 where nothing is; smooth normal, float32 [3]; albedo, float32 [3]).
+        scene: checksum of the scene.
     """
 
     camera: Camera
@@ -50,16 +53,20 @@ class SceneMap:
 
     @property
     def share(self) -> float:
-        """Samples that were taken, of the picture's pixels."""
+        """Samples that were taken, as a share of the picture's pixels."""
         return float(self.maps.counts[0] / (self.width * self.height))
 
 
 def bake_scene_map(
     scene: StillScene, camera: int = 0, width: int = 513, height: int = 513, *, device: str | None = None
 ) -> SceneMap:
-    """Samples what one of the scene's cameras sees.
+    """Samples what one of the scene's cameras sees. Source: Jeng 2005, section 3.3.2.
 
-    camera: its place among the scene's cameras.
+    Args:
+        scene: with at least one camera.
+        camera: its place among the scene's cameras, counted from 0.
+        width, height: of the picture, pixels, 2 to 4096.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
 
     Raises:
         ValueError: there is no such camera, or the picture has no size.

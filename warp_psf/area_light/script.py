@@ -53,7 +53,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Script:
-    """A script as read. cameras: the viewpoints' names, of which the first one begins. lights: their planes."""
+    """A script as `read_script` reads it.
+
+    Attributes:
+        cameras: the viewpoints' names, of which the first one begins.
+        lights: the plane of samples of each light, by its name.
+        steps: what changes, and over how many frames, in order.
+    """
 
     cameras: tuple[str, ...]
     lights: dict[str, LightPlane]
@@ -67,7 +73,13 @@ class Script:
 
 @dataclass(frozen=True, eq=False)
 class SlabFrame:
-    """A frame of a script: linear pictures, float32 [height, width, 3], as those of `SlabView`, and its camera."""
+    """A frame of a script.
+
+    Attributes:
+        color, attenuation, shadowless: linear, float32 [height, width, 3], as `SlabView.picture`,
+            `SlabView.attenuation` and `SlabView.shadowless`.
+        camera: its place among the script's cameras.
+    """
 
     color: np.ndarray
     attenuation: np.ndarray
@@ -76,7 +88,20 @@ class SlabFrame:
 
 
 def read_script(path: str | Path) -> Script:
-    """Reads a script.
+    """Reads a script of changes of light: a JSON file, at most 10 MB, such as
+
+        {"cameras": ["front", "side"],
+         "lights": {"lamp": {"position": [0, 0, 2], "target": [0, 0, 0], "width": 1.2, "height": 1.2,
+                             "rows": 15, "columns": 15}},
+         "steps": [{"camera": "front", "lamp": {"shape": "square", "side": 0.4, "radiance": [90, 80, 70]}},
+                   {"frames": 24, "lamp": {"at": [0.5, 0.0]}},
+                   {"frames": 12, "camera": "side", "lamp": {"on": false}}]}
+
+    A light is a rectangle, as of `rectangle_light`, of rows x columns samples. A step lasts some frames, 1 unless it
+    says so, and says what changes: the camera, and of a light whether it is `on`, its `radiance`, its `shape` (square,
+    line, ring or letters) and what that shape takes (`side`, `at`, `angle`, `radius`, `width`, `text`; see
+    `templates`). Numbers go evenly from what they were to what the step says, over its frames; all else changes with
+    its first frame and stays. A light that no step has named is off.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -106,13 +131,27 @@ def play_script(
     size: int = 513,
     device: str | None = None,
 ) -> Iterator[SlabFrame]:
-    """The frames of a script.
+    """The frames of a script, one after another; slabs and scene maps are baked before the first one.
 
-    scene: with the script's cameras, in their order. width, height: of the pictures, pixels. size: of a full shadow
-    map. Slabs and scene maps are baked before the first frame.
+    Each has `color`, `attenuation` and `shadowless`, linear, float32 [height, width, 3], as `SlabView.picture`,
+    `SlabView.attenuation` and `SlabView.shadowless`, and `camera`, the place of its camera among the script's.
+
+    ```python
+    script = psf.area_light.read_script("script.json")
+    scene = psf.freeze_scene(model, data, cameras=script.cameras)
+    films = [frame.color for frame in psf.area_light.play_script(script, scene, width=160, height=120, size=65)]
+    ```
+
+    Args:
+        script: of `read_script`.
+        scene: with the script's cameras, in their order.
+        width, height: of the pictures, pixels, 2 to 4096.
+        size: samples along the side of a full shadow map, 2^n + 1, at most 4097.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
 
     Raises:
         ValueError: the scene has another number of cameras, or a size is not usable.
+        TypeError: `script` or `scene` is something else.
     """
     check_type("script", script, Script, "read_script")
     check_type("scene", scene, StillScene, "freeze_scene or make_still")

@@ -42,10 +42,13 @@ NARROWEST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LightPlane:
-    """A rectangle of light samples: cells of rows x columns, of which any may shine.
+    """A rectangle of light samples: cells of rows x columns, of which any may shine. See `make_light_plane`.
 
-    center: metres, [3]. right, up: from the centre to the middle of the right and of the upper side, at right angles,
-        metres, [3]; the plane shines along right x up. rows, columns: of samples; row 0 is the uppermost.
+    Attributes:
+        center: world, metres, float64 [3].
+        right, up: from the centre to the middle of the right and of the upper side, at right angles, metres, float64
+            [3]; the plane shines along right x up.
+        rows, columns: of samples, 1 to 64; row 0 is the uppermost.
 
     Raises:
         ValueError: a value is not a number or of another shape, a side has no length, the sides are not at right
@@ -86,7 +89,7 @@ class LightPlane:
 
     @property
     def cell_area(self) -> float:
-        """Of a sample, m^2."""
+        """The area of a sample's cell, m^2."""
         return 4.0 * float(np.linalg.norm(self.right) * np.linalg.norm(self.up)) / (self.rows * self.columns)
 
     @property
@@ -98,7 +101,11 @@ class LightPlane:
 
 
 def make_light_plane(light: AreaLight, rows: int, columns: int) -> LightPlane:
-    """The plane of a rectangular light, whose place it takes: row 0 is at its +y.
+    """The plane of a rectangular light, whose place it takes: row 0 is at its +y. Its radiance is of no matter.
+
+    Args:
+        light: of `rectangle_light`, in the world.
+        rows, columns: of samples, 1 to 64.
 
     Raises:
         ValueError: the light is no flat rectangle or hangs on a body, or there is no row or column.
@@ -119,10 +126,12 @@ def make_light_plane(light: AreaLight, rows: int, columns: int) -> LightPlane:
 class ShadowSlab:
     """The shadow maps of a light plane's samples, row after row. Built by `bake_shadow_slab`.
 
-    window: of each sample's map: the middle of its square (right, up), tangents, float32 [maps, 2].
-    half: half the square's side, as a tangent.
-    maps: samples are (inverse depth 1/m, float32; surface, int32; 0 and -1 where nothing is).
-    scene: checksum of the scene.
+    Attributes:
+        plane: the light samples.
+        window: of each sample's map: the middle of its square (right, up), tangents, float32 [maps, 2].
+        half: half the square's side, as a tangent.
+        maps: quad-trees, whose samples are (inverse depth 1/m, float32; surface, int32; 0 and -1 where nothing is).
+        scene: checksum of the scene.
     """
 
     plane: LightPlane
@@ -133,7 +142,7 @@ class ShadowSlab:
 
     @property
     def share(self) -> float:
-        """Samples that were taken, of those of full maps."""
+        """Samples that were taken, as a share of those of full maps."""
         return float(self.maps.counts.sum() / (len(self.maps.counts) * self.maps.size**2))
 
 
@@ -145,11 +154,17 @@ def bake_shadow_slab(
     preset: int | None = None,
     device: str | None = None,
 ) -> ShadowSlab:
-    """Samples the shadow map of every light sample adaptively.
+    """Samples the shadow map of every light sample adaptively. Source: Jeng 2005, section 3.3.1.
 
-    size: samples along the side of a full map, 2^n + 1. preset: the level to which maps are divided everywhere; 5, or n
-    where that is less; with n the maps are full. What the scene's cameras see is what the maps cover; without cameras,
-    all of the scene.
+    What the scene's cameras see is what the maps cover; without cameras, all of the scene.
+
+    Args:
+        scene: what casts shadows, and takes them.
+        plane: the light samples.
+        size: samples along the side of a full map, 2^n + 1, at most 4097.
+        preset: the level to which maps are divided everywhere, 0 to n; 5, or n where that is less, without. With n the
+            maps are full.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
 
     Raises:
         ValueError: a value is not usable, nothing of the scene is before the plane, or the maps are too many and large.

@@ -52,8 +52,11 @@ class PointTable:
 class DevicePoints:
     """Point lists as `splat_points` takes them for many pictures. Built by `upload_points`.
 
-    groups: of each list, from where to where.
-    sizes: sides of the lists' squares, metres.
+    Attributes:
+        table: the points, on the device.
+        groups: of each list, from where to where.
+        sizes: sides of the lists' squares, metres.
+        device: where they are.
     """
 
     table: PointTable
@@ -64,12 +67,13 @@ class DevicePoints:
 
 @dataclass(frozen=True, eq=False)
 class PointPicture:
-    """What points show.
+    """What points show. Built by `splat_points`.
 
-    color: albedo under a lamp at the viewer, linear, float32 [height, width, 3].
-    depth: metres along the optical axis, infinite where nothing is, float32 [height, width].
-    level: the list of the splat that is seen, counted from 0, -1 where nothing is, int32 [height, width].
-    points: how many were rendered, after culling and detail control.
+    Attributes:
+        color: albedo under a lamp at the viewer, linear, float32 [height, width, 3].
+        depth: metres along the optical axis, infinite where nothing is, float32 [height, width].
+        level: the list of the splat that is seen, counted from 0, -1 where nothing is, int32 [height, width].
+        points: how many were rendered, after culling and detail control.
     """
 
     color: np.ndarray
@@ -81,7 +85,12 @@ class PointPicture:
 def upload_points(lists: PointLists, device: str | None = None) -> DevicePoints:
     """Brings point lists to the device.
 
+    Args:
+        lists: of `sample_points`.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
+
     Raises:
+        ValueError: there is no such device.
         TypeError: they are something else.
     """
     check_type("lists", lists, PointLists, "sample_points")
@@ -109,6 +118,11 @@ def splat_points(points: DevicePoints, camera: Camera, width: int, height: int) 
     """The picture of a camera.
 
     Source: Jeng 2005, section 5.3. Depths within a splat are those of its triangle's plane.
+
+    Args:
+        points: of `upload_points`.
+        camera: any, such as one of the scene's.
+        width, height: of the picture, pixels.
 
     Raises:
         ValueError: the picture has no size, or the camera has no pose or film.

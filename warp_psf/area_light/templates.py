@@ -16,7 +16,10 @@ FINER = 8
 def square(rows: int, columns: int, side: float = 0.5, at: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     """A square about a point of the plane.
 
-    side: in shares of the plane's shorter side. at: the middle, right and up, from -1 to 1 across the plane.
+    Args:
+        rows, columns: of the plane's samples.
+        side: in shares of the plane's shorter side.
+        at: the middle, right and up, from -1 to 1 across the plane.
     """
     x, y = _places(rows, columns, at)
     reach = side * min(rows, columns) / 2.0
@@ -24,13 +27,25 @@ def square(rows: int, columns: int, side: float = 0.5, at: tuple[float, float] =
 
 
 def line(rows: int, columns: int, angle: float = 0.0, at: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    """A line of one sample's width across the plane, at `angle` radians to its rows, with soft rims."""
+    """A line of one sample's width across the plane, with soft rims.
+
+    Args:
+        rows, columns: of the plane's samples.
+        angle: to the plane's rows, radians, counter-clockwise where row 0 is the uppermost.
+        at: a point that it goes through, right and up, from -1 to 1 across the plane.
+    """
     x, y = _places(rows, columns, at)
     return np.clip(1.0 - np.abs(y * np.cos(angle) - x * np.sin(angle)), 0.0, 1.0).astype(np.float32)
 
 
 def ring(rows: int, columns: int, radius: float = 0.7, width: float = 0.25) -> np.ndarray:
-    """A ring about the middle; radius of its middle line and width, in shares of half the plane's shorter side."""
+    """A ring about the middle.
+
+    Args:
+        rows, columns: of the plane's samples.
+        radius: of its middle line, in shares of half the plane's shorter side.
+        width: across the line, in the same shares.
+    """
     x, y = _places(rows, columns, (0.0, 0.0))
     half = min(rows, columns) / 2.0
     aside = np.abs(np.hypot(x, y) - radius * half)
@@ -39,6 +54,10 @@ def ring(rows: int, columns: int, radius: float = 0.7, width: float = 0.25) -> n
 
 def letters(rows: int, columns: int, text: str = "A") -> np.ndarray:
     """Letters as large as the plane allows.
+
+    Args:
+        rows, columns: of the plane's samples.
+        text: what is written.
 
     Raises:
         ValueError: the text is empty.

@@ -27,11 +27,21 @@ def freeze_scene(
     scene_option: mujoco.MjvOption | None = None,
     material_space: str = "srgb",
 ) -> StillScene:
-    """What MuJoCo would draw of a state, as triangles in the world, seen by cameras.
+    """What MuJoCo would draw of a state, as triangles in the world, seen by cameras; for `area_light`.
 
-    data: None takes the model's initial state. cameras: ids, names, -1 for the free camera, or `MjvCamera`s.
-    scene_option: what is drawn; MuJoCo's defaults without. Skins and flexes come as they are bent now; sites and
-    tendons, which cast no shadows, are left out.
+    Skins and flexes come as they are bent now; sites and tendons, which cast no shadows, are left out. A texture counts
+    with its mean.
+
+    ```python
+    scene = psf.freeze_scene(model, data, cameras=["front", "side"])  # an area_light.StillScene
+    ```
+
+    Args:
+        model: the compiled model.
+        data: its state; None takes the model's initial one.
+        cameras: a list of ids, names, -1 for the free camera, or `MjvCamera`s.
+        scene_option: what is drawn; MuJoCo's defaults without.
+        material_space: whether MJCF's rgba is "srgb" or "linear".
 
     Raises:
         ValueError: there is no such camera, `data` is of another model, or nothing is drawn.

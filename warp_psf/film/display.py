@@ -27,10 +27,16 @@ NEUTRAL_REFLECTANCE = np.float32(0.04)
 def to_display(radiance: np.ndarray, *, exposure: float = 0.0, view: str = "neutral") -> np.ndarray:
     """The picture that a screen shows: uint8 [height, width, 3], sRGB.
 
-    radiance: linear Rec.709, floats [height, width, 3]. NaN and negative values show as 0, infinity saturates.
-    exposure: stops; the radiance is multiplied by 2^exposure.
-    view: "neutral" is the Khronos PBR Neutral tone mapper, which keeps colours below 0.76 and rolls highlights off
-        towards white (Khronos PBR Neutral Tone Mapper specification, version 1.0); "srgb" cuts off at 1.
+    ```python
+    brighter = psf.to_display(np.full((90, 160, 3), 0.18), exposure=1.0, view="srgb")
+    ```
+
+    Args:
+        radiance: linear Rec.709, floats [height, width, 3]. NaN and negative values show as 0, infinity saturates.
+        exposure: stops within 64 of 0; the radiance is multiplied by 2^exposure.
+        view: "neutral" is the Khronos PBR Neutral tone mapper, which takes away up to 0.04 (what a smooth dielectric
+            reflects), keeps what is then below 0.76 and rolls highlights off towards white (Khronos PBR Neutral Tone
+            Mapper specification, version 1.0); "srgb" cuts off at 1.
 
     Raises:
         ValueError: the array is not a float image, the view is unknown, or the exposure is not within 64 stops.

@@ -55,24 +55,35 @@ QUEUE_LENGTH = 2
 class FrameSequence:
     """Writes the frames of a sequence into a folder, in the background, and the film at the end.
 
-        with FrameSequence("out", settings, frames=range(120), frames_per_second=24) as sequence:
-            for index in sequence.frames:
-                if sequence.missing(index):
-                    sequence.write(index, layers, image, world_from_camera)
-            sequence.finish()
+    ```python
+    settings = {"model": "model.xml", "bounces": 1}
+    with (
+        psf.Renderer(model, height=60, width=80, bounces=1) as renderer,
+        psf.FrameSequence("film", settings, frames=range(6), frames_per_second=24) as sequence,
+    ):
+        for index in sequence.frames:
+            if sequence.missing(index):
+                renderer.update_scene(data, camera="front")
+                image, layers = renderer.render(), renderer.layers()
+                sequence.write(index, layers, image, renderer.world_from_camera)
+            mujoco.mj_step(model, data)
+        sequence.finish()
+    ```
 
     Every file is whole under its name or not there, so a run that was killed is continued by the same lines. Entering
     creates the folder, takes its lock and clears what a dead run left; leaving waits for the frames that were handed
-    over, also after an error or Ctrl-C.
+    over, also after an error or Ctrl-C. `folder` and `frames` can be read again.
 
-    folder: frames are frame_0000.exr and .png, beside film.mp4, contact_sheet.png and settings.json.
-    settings: plain values (numbers, text, lists, None) that decide how a frame looks. They are kept in the folder, and
-        a run with others is refused; the range of frames and the formats may change. `exposure` and `view` among them
-        are used when the film is made from EXR frames.
-    frames: the indices of the film, not negative.
-    formats: some of "exr", "png", "mp4". The contact sheet is always made. With "mp4" alone the frames are kept only
-        until the film is finished.
-    overwrite: removes what a former sequence wrote into the folder, and nothing else.
+    Args:
+        folder: frames are frame_0000.exr and .png, beside film.mp4, contact_sheet.png and settings.json.
+        settings: plain values (numbers, text, lists, None) that decide how a frame looks. They are kept in the folder,
+            and a run with others is refused; the range of frames and the formats may change. `exposure` and `view`
+            among them are used when the film is made from EXR frames.
+        frames: the indices of the film, not negative.
+        frames_per_second: from 0.01 to 1000; kept with the settings.
+        formats: some of "exr", "png", "mp4". The contact sheet is always made. With "mp4" alone the frames are kept
+            only until the film is finished.
+        overwrite: removes what a former sequence wrote into the folder, and nothing else.
 
     Raises:
         ValueError: bad arguments; on entering, settings that differ or files in the way.
@@ -135,7 +146,11 @@ class FrameSequence:
             self._raise_failure()
 
     def missing(self, index: int) -> bool:
-        """Whether the frame needs rendering: one of its files is not on the disk, or is empty."""
+        """Whether the frame needs rendering: one of its files is not on the disk, or is empty.
+
+        Raises:
+            ValueError: the index is not of this sequence.
+        """
         return any(not _is_complete(path) for path in self._frame_paths(index))
 
     def write(
@@ -143,10 +158,17 @@ class FrameSequence:
     ) -> None:
         """Hands a frame over to be written; its files that exist already are left as they are.
 
-        layers: see `write_exr`. image: uint8 [height, width, 3]. The arrays are copied: the caller may reuse them.
+        Args:
+            index: of the frame.
+            layers: for the EXR file, as `Renderer.layers` returns them: float [height, width] or [height, width, 3],
+                without NaN, and `segmentation`, integers [height, width, 2]. They are copied: the caller may reuse
+                them.
+            image: for the PNG file, of which the film is made if there is one, uint8 [height, width, 3]; copied, too.
+            world_from_camera: the camera's pose [4, 4], for the EXR file, or None.
 
         Raises:
-            ValueError, OSError: an earlier frame could not be written, or the index is not of this sequence.
+            ValueError: the index is not of this sequence, the sequence is not open, or an earlier frame was not usable.
+            OSError: an earlier frame could not be written.
         """
         if self._writer is None:
             raise ValueError("the sequence is not open: use it in a with statement")
@@ -163,7 +185,8 @@ class FrameSequence:
         """Waits for the frames and makes film.mp4 (where asked for) and contact_sheet.png from the files on the disk.
 
         Raises:
-            ValueError, OSError: frames are missing or could not be written.
+            ValueError: frames are missing, damaged or were not usable.
+            OSError: frames or the film could not be written.
         """
         self._waiting.join()
         self._raise_failure()

@@ -94,9 +94,20 @@ def write_exr(
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """The layers of an EXR under the names that `write_exr` took: float32, segmentation int32.
+    """The layers of an EXR under the names that they were written by: float32, segmentation int32.
 
-    Files of other programs are read too: R, G, B is `color`, a.R, a.G, a.B is `a`, and a single channel keeps its name.
+    ```python
+    with psf.FrameSequence("stills", {}, frames=range(1), frames_per_second=24, formats=("exr",)) as sequence:
+        sequence.write(0, {"color": np.ones((60, 80, 3), np.float32)}, np.zeros((60, 80, 3), np.uint8), None)
+    color = psf.read_exr("stills/frame_0000.exr")["color"]  # float32 [60, 80, 3]
+    ```
+
+    Files of other programs are read too: R, G, B is `color`, a.R, a.G, a.B is `a`, Z is `depth`, and any other single
+    channel keeps its name. Layers of three are [height, width, 3], single ones [height, width]. Three were written as
+    half floats, so that they come back rounded to 11 bits.
+
+    Args:
+        path: of the file.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -226,7 +237,11 @@ def sheet_indices(count: int, columns: int = 4) -> list[int]:
 
 
 def image_difference(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
-    """How far two arrays of one shape lie apart, in their own units: rmse, maximum and mean_absolute.
+    """How far two arrays of one shape lie apart, in their own units: `rmse`, `maximum` and `mean_absolute`.
+
+    ```python
+    shift = psf.image_difference(np.zeros((60, 80, 3)), np.full((60, 80, 3), 0.1))["rmse"]  # 0.1
+    ```
 
     Raises:
         ValueError: the shapes differ, there are no pixels, or one holds 8-bit values and the other linear floats.

@@ -34,12 +34,19 @@ LUMINANCE = np.array((0.2126, 0.7152, 0.0722))
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """Light from infinitely far away.
+    """Light from infinitely far away. `load_environment` makes one of a name, a file or an array.
 
-    name: what messages call it.
-    radiance: linear Rec.709, float32 [rows, columns, 3]. Row 0 is +z, the last row -z; column c lies at azimuth
-        2 pi (c + 1/2) / columns from +x towards +y. Photographs are read in this orientation too.
-    coefficients: SH coefficients [n*n, 3] where the light is exactly band-limited (`from_coefficients`), else None.
+    ```python
+    dusk = psf.load_environment("sunset").rotated(np.pi / 2)
+    upwards = dusk.lookup([0, 0, 1])  # radiance from straight above, [3]
+    ```
+
+    Attributes:
+        name: what messages call it.
+        radiance: linear Rec.709, float32 [rows, columns, 3]. Row 0 is +z, the last row -z; column c lies at azimuth
+            2 pi (c + 1/2) / columns from +x towards +y. Photographs are read in this orientation too.
+        coefficients: SH coefficients, float64 `[n*n, 3]`, where the light is exactly band-limited, else None; see
+            `from_coefficients`.
 
     Raises:
         ValueError: `radiance` has another shape, no pixels, or pixels that are NaN, infinite or negative.
@@ -54,9 +61,14 @@ class Environment:
 
     @staticmethod
     def from_coefficients(coefficients: np.ndarray, name: str = "coefficients") -> Environment:
-        """The exactly band-limited light of SH `coefficients` [n*n, 3], linear Rec.709.
+        """The exactly band-limited light of SH `coefficients`, linear Rec.709.
 
         It may be negative where the coefficients make it so; `radiance`, the image for the background, is clamped.
+
+        Args:
+            coefficients: of real, orthonormal spherical harmonics without the Condon-Shortley phase, `[n*n, 3]`: that
+                of band l and order m is number `l*l + l + m`.
+            name: what messages call it.
 
         Raises:
             ValueError: the shape is another, or a coefficient is not finite.
@@ -71,7 +83,7 @@ class Environment:
         return Environment(name, np.maximum(sh.evaluate(directions, order) @ coefficients, 0.0), coefficients)
 
     def project(self, order: int) -> np.ndarray:
-        """SH coefficients, float64 [order*order, 3].
+        """SH coefficients, float64 `[order*order, 3]`, of `order` bands, at least 1; see `from_coefficients`.
 
         A cell has one radiance all over its solid angle. The integral over azimuth is exact; that over the polar angle
         is Gauss-Legendre's. Band-limited light is padded with zeros or truncated.
@@ -91,7 +103,10 @@ class Environment:
         return np.einsum("rk,rkx->kx", polar, by_row[:, m + order - 1])
 
     def lookup(self, directions: np.ndarray) -> np.ndarray:
-        """Radiance [..., 3] from `directions` [..., 3] (any length but 0), bilinear, periodic in azimuth."""
+        """Radiance, float64 [..., 3], from where `directions` [..., 3] point (any length but 0).
+
+        Bilinear in `radiance`, periodic in azimuth.
+        """
         directions = np.asarray(directions, dtype=np.float64)
         rows, columns = self.radiance.shape[:2]
         x, y, z = np.moveaxis(directions, -1, 0)
@@ -124,7 +139,7 @@ class Environment:
         return Environment(self.name, (1.0 - part) * near + part * far)
 
     def mean_luminance(self) -> float:
-        """The mean over the sphere of the luminance."""
+        """The mean over the sphere of the luminance of `radiance`."""
         solid_angles = sphere.latlong_solid_angles(*self.radiance.shape[:2])
         return float(np.sum(solid_angles * (self.radiance @ LUMINANCE)) / (4.0 * np.pi))
 
@@ -134,9 +149,19 @@ def load_environment(value: None) -> None: ...
 @overload
 def load_environment(value: str | os.PathLike | np.ndarray | Environment) -> Environment: ...
 def load_environment(value: str | os.PathLike | np.ndarray | Environment | None) -> Environment | None:
-    """The environment that a user named: a built-in's name, a path, an array [rows, columns, 3], or None for none.
+    """The environment that is named: by a built-in's name, a path, or an array.
 
-    Paths end in .exr or .hdr. Images larger than 512 x 1024 are box-filtered to that size.
+    ```python
+    sky = psf.load_environment("sky")
+    from_above = np.zeros((2, 1, 3))
+    from_above[0] = 1.5, 1.4, 1.3
+    lit_from_above = psf.load_environment(from_above)
+    ```
+
+    Args:
+        value: "studio", "sky", "sunset" or "overcast"; the path of an .exr or .hdr image; radiance, linear Rec.709,
+            [rows, columns, 3], in the orientation of `Environment`; an `Environment`, which is returned as it is; or
+            None, which is returned, too. Images larger than 512 x 1024 are box-filtered to that size.
 
     Raises:
         FileNotFoundError: there is no built-in and no file of that name.

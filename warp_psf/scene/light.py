@@ -25,15 +25,25 @@ SHORTEST_LENGTH = 1e-9
 class AreaLight:
     """A mesh that shines with the same radiance in every direction from the front of every face.
 
-    name: what messages call it.
-    mesh: its shape, in the light's own frame.
-    radiance: linear Rec.709, 3 values >= 0.
-    position: of the light's frame in its parent's, metres, float64 [3].
-    rotation: parent_from_light rotation matrix, float64 [3, 3].
-    body: name of the MuJoCo body that is the parent, so that the light moves with the simulation; None is the world.
+    `rectangle_light` and `sphere_light` make the usual ones.
+
+    ```python
+    mesh = psf.load_mesh("mesh.obj")
+    light = psf.AreaLight("glowing body", mesh, radiance=(4, 3, 2), position=(0, 0, 2))
+    ```
+
+    Attributes:
+        name: what messages call it.
+        mesh: its shape, in the light's own frame.
+        radiance: linear Rec.709, float64 [3], finite and not negative.
+        position: of the light's frame in its parent's, metres, float64 [3].
+        rotation: parent_from_light rotation matrix, float64 [3, 3].
+        body: name of the MuJoCo body that is the parent, so that the light moves with the simulation; None is the
+            world.
 
     Raises:
-        ValueError: a value is NaN, negative or of another shape, or `rotation` is not a rotation.
+        ValueError: a value is NaN or infinite, a radiance is negative, an array has another shape, or `rotation` is not
+            a rotation.
         TypeError: `mesh` is not a `Mesh`.
     """
 
@@ -57,6 +67,13 @@ class AreaLight:
 class DeltaLight:
     """A light as MJCF describes it: directional, spot or point, or MuJoCo's headlight.
 
+    A renderer shows the model's own lights by itself; these are for such that the model lacks.
+
+    ```python
+    spot = psf.DeltaLight("spot", "spot", position=(0, 0, 3), direction=(0, 0, -1), diffuse=(0.8, 0.8, 0.8),
+                          specular=(0.3, 0.3, 0.3), ambient=(0, 0, 0), cutoff=np.radians(30), exponent=10, radius=0.02)
+    ```
+
     The colours have MuJoCo's classic meaning: a white Lambert surface that faces the light has the colour `diffuse`.
     A light that reaches a receiver unhindered therefore causes, per unit of the cosine, the irradiance
 
@@ -65,24 +82,25 @@ class DeltaLight:
     where d is the distance in metres and spot = cos(angle to `direction`)^exponent within `cutoff`, 0 outside it.
     A directional light has neither factor, a point light no spot factor. Beyond `range` spot and point lights end.
 
-    name: what messages call it.
-    kind: which of the three.
-    position, direction: in the world, metres and a unit vector that points away from the light, float64 [3]. What a
-        scene holds is the pose in the model's initial state; `bridge.read_delta_lights` brings that of a frame.
-    diffuse, specular: what lights the Lambert part and the Phong lobe, linear, 3 values >= 0.
-    ambient: added to every surface as ambient * albedo, linear, 3 values >= 0.
-    attenuation: constant, linear (1/m) and quadratic (1/m^2) coefficients, 3 values >= 0.
-    cutoff: half-angle of a spot's cone, radians.
-    exponent: how fast a spot fades towards its rim.
-    range: metres.
-    radius: of the bulb (MJCF `bulbradius`), metres: wider ones cast softer shadows.
-    castshadow: False lets its light through everything.
-    index: MuJoCo's id of the light, -1 for the headlight, which sits at the camera and looks where that looks;
-        None stays where it is.
+    Attributes:
+        name: what messages call it.
+        kind: "directional", "spot" or "point".
+        position: in the world, metres, float64 [3]; of no matter for a directional light.
+        direction: in the world, away from the light, float64 [3]; any length but 0 comes in, a unit vector is kept.
+        diffuse, specular: what lights the Lambert part and the Phong lobe, linear, float64 [3], not negative.
+        ambient: added to every surface as `ambient * albedo`, linear, float64 [3], not negative.
+        attenuation: constant, linear (1/m) and quadratic (1/m^2) coefficients, float64 [3], not negative.
+        cutoff: half-angle of a spot's cone, radians.
+        exponent: how fast a spot fades towards its rim.
+        range: metres; infinite by default.
+        radius: of a spot's or point light's bulb (MJCF `bulbradius`), metres: wider ones cast softer shadows.
+        castshadow: False lets its light through everything.
+        index: of the model's light whose pose it takes in every frame; -1 is the headlight, which sits at the camera
+            and looks where that looks; None stays where it is.
 
     Raises:
-        ValueError: a value is NaN, negative, infinite (but for `range`) or of another shape, or `direction` has no
-            length.
+        ValueError: the kind is unknown, a value is NaN, negative where it must not be, infinite (but for `range`) or of
+            another shape, or `direction` has no length.
     """
 
     name: str
@@ -133,7 +151,12 @@ def rectangle_light(
 ) -> AreaLight:
     """A flat rectangle that shines along its own +z, turned towards `target` or as `rotation` says.
 
+    ```python
+    lamp = psf.rectangle_light("lamp", 1.0, 0.6, radiance=(8, 7, 6), position=(0, -1, 2), target=(0, 0, 0))
+    ```
+
     Args:
+        name: what messages call it.
         width, height: its sides along its own x and y, metres.
         radiance: linear Rec.709, 3 values.
         position: of its centre in the parent's frame, metres, [3].
@@ -142,7 +165,8 @@ def rectangle_light(
         body: the parent, as in `AreaLight`.
 
     Raises:
-        ValueError: a side is not positive, both `target` and `rotation` are given, or `target` is `position`.
+        ValueError: a side is not positive, both `target` and `rotation` are given, `target` is `position`, or a value
+            is not usable, as in `AreaLight`.
     """
     owner = f"light {name!r}"
     for side, value in (("width", width), ("height", height)):
@@ -161,6 +185,7 @@ def sphere_light(name: str, radius: float, radiance, position, *, body: str | No
     """A sphere that shines to all sides.
 
     Args:
+        name: what messages call it.
         radius: metres.
         radiance: linear Rec.709, 3 values.
         position: of its centre in the parent's frame, metres, [3].

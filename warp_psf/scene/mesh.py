@@ -30,19 +30,20 @@ SUFFIXES = (".glb", ".obj", ".ply", ".stl")
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh in its own frame. Built by `make_mesh`; its arrays are read-only.
+    """A triangle mesh in its own frame. Built by `make_mesh` and `load_mesh`; its arrays are read-only.
 
-    name: what messages call it.
-    vertices: positions, metres, float32 [V, 3].
-    faces: vertex indices, counter-clockwise seen from outside, int32 [F, 3].
-    normals: unit vertex normals, float32 [V, 3]; at creases a position has one vertex per smooth side.
-    slab: (center [3], rotation [3, 3], half_extents [3]), float64 in the mesh's frame, when the surface is exactly a
-        box or a flat rectangle, else None. The rotation's columns are the box's axes; column 2 is the
-        normal of a largest side. A rectangle has half_extents[2] = 0 and column 2 on the side that its faces show.
-    sphere: radius, metres, when the surface is a tessellated sphere about the mesh's origin, else None.
-    convex: the surface is closed, of one piece, and bulges nowhere inwards.
-    closed: every edge has a face on both sides, so that there is an inside.
-    center, radius: the smallest sphere around the vertices, float64 [3] and metres.
+    Attributes:
+        name: what messages call it.
+        vertices: positions, metres, float32 [V, 3].
+        faces: vertex indices, counter-clockwise seen from outside, int32 [F, 3].
+        normals: unit vertex normals, float32 [V, 3]; at creases a position has one vertex per smooth side.
+        slab: (center [3], rotation [3, 3], half_extents [3]), float64 in the mesh's frame, when the surface is exactly
+            a box or a flat rectangle, else None. The rotation's columns are the box's axes; column 2 is the normal of a
+            largest side. A rectangle has half_extents[2] = 0 and column 2 on the side that its faces show.
+        sphere: radius, metres, when the surface is a tessellated sphere about the mesh's origin, else None.
+        convex: the surface is closed, of one piece, and bulges nowhere inwards.
+        closed: every edge has a face on both sides, so that there is an inside.
+        center, radius: the smallest sphere around the vertices, float64 [3] and metres.
     """
 
     name: str
@@ -58,7 +59,15 @@ class Mesh:
 
 
 def make_mesh(name: str, vertices, faces, normals=None, smooth_angle: float = CREASE_ANGLE) -> Mesh:
-    """A mesh from arrays; warns of what it had to mend.
+    """A mesh from arrays.
+
+    Faces that are wound unlike their neighbours, or inwards, are turned, and those without area dropped: a warning says
+    so, as of an open surface. Vertices are split at creases, so that the mesh may have more of them than came.
+
+    ```python
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    wedge = psf.make_mesh("wedge", corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    ```
 
     Args:
         name: what messages call it.
@@ -103,7 +112,12 @@ def make_mesh(name: str, vertices, faces, normals=None, smooth_angle: float = CR
 def load_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
     """Reads an OBJ, STL, PLY or GLB file as one mesh, in the axes of the file.
 
-    Scene graphs are flattened, quads are cut into triangles, normals are computed by `make_mesh`.
+    Scene graphs are flattened, quads are cut into triangles, materials left out, and what is broken is mended, and
+    normals computed, by `make_mesh`.
+
+    ```python
+    mesh = psf.load_mesh("mesh.obj", scale=0.001)  # a file in millimetres
+    ```
 
     Args:
         path: the file.

@@ -94,48 +94,53 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             gain[place] = between.horizon_gain(covered, surface.normal, lighting[0].weights[0], o[0].quadrature)
         count = int(0)
         faces = int(0)
+        # What is accumulated is not changed under a condition, where a compiler would copy it at every branch.
         for place in range(sources.count):
             source = entity_at[place]
-            weighted = weight[place] * transfer
-            if bodies.field[source] >= 0:
-                passed = values(1.0)
+            if bodies.field[source] < 0:
+                continue
+            passed = values(1.0)
+            for other in range(sources.count):
+                share = float(0.0)
+                if other != place:
+                    share = overlap(toward[other], sine[other], toward[place], sine[place])
+                if share > 0.0:
+                    further = (distance[place] - distance[other]) / (radius[place] + radius[other])
+                    share *= hides_body(world, entity_at[other], ahead[other], source, further, patches, relations)
+                if share <= 0.0:
+                    continue
+                passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+            p_body = wp.transpose(poses[0].rotation[world, source]) * (p - poses[0].position[world, source])
+            where = radiant.locate(fields, bodies.field[source], p_body)
+            light = (gain[place] * weight[place]) * wp.cw_mul(passed, transfer)
+            rows = o[0].rows[world, source]
+            kept.entity[world, station, count] = source
+            kept.irradiance[world, station, count] = radiant.basis_irradiance(fields, where, kit.project(light, rows))
+            kit.keep_moments(world, station, count, proxy, source, light, rows, o[0].quadrature, fields, where, gloss)
+            count += 1
+        for place in range(sources.count):
+            source = entity_at[place]
+            if patches[0].first_face[source] < 0:
+                continue
+            to_slab = slab_from_world(world, source, poses, patches)
+            p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
+            for side in range(6):
+                face = patches[0].first_face[source] + side
+                if faces == kept.face.shape[2]:
+                    continue
+                if not patch.sees_face(world, face, p_slab, patches):
+                    continue
+                passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o[0].quadrature)
                 for other in range(sources.count):
+                    share = float(0.0)
                     if other != place:
-                        share = overlap(toward[other], sine[other], toward[place], sine[place])
-                        if share > 0.0:
-                            further = (distance[place] - distance[other]) / (radius[place] + radius[other])
-                            share *= hides_body(
-                                world, entity_at[other], ahead[other], source, further, patches, relations
-                            )
-                        if share > 0.0:
-                            passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                p_body = wp.transpose(poses[0].rotation[world, source]) * (p - poses[0].position[world, source])
-                where = radiant.locate(fields, bodies.field[source], p_body)
-                light = gain[place] * wp.cw_mul(passed, weighted)
-                rows = o[0].rows[world, source]
-                kept.entity[world, station, count] = source
-                kept.irradiance[world, station, count] = radiant.basis_irradiance(
-                    fields, where, kit.project(light, rows)
-                )
-                kit.keep_moments(
-                    world, station, count, proxy, source, light, rows, o[0].quadrature, fields, where, gloss
-                )
-                count += 1
-            elif patches[0].first_face[source] >= 0:
-                to_slab = slab_from_world(world, source, poses, patches)
-                p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
-                for side in range(6):
-                    face = patches[0].first_face[source] + side
-                    if patch.sees_face(world, face, p_slab, patches) and faces < kept.face.shape[2]:
-                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o[0].quadrature)
-                        for other in range(sources.count):
-                            if other != place:
-                                share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
-                                if share > 0.0:
-                                    passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                        kept.face[world, station, faces] = face
-                        kept.transport[world, station, faces] = wp.cw_mul(passed, weighted)
-                        faces += 1
+                        share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
+                    if share <= 0.0:
+                        continue
+                    passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+                kept.face[world, station, faces] = face
+                kept.transport[world, station, faces] = weight[place] * wp.cw_mul(passed, transfer)
+                faces += 1
         if proxy >= first_texel:
             openness = kit.sum_of_products(open_to, transfer) / wp.pi
             block = block_of(proxy - first_texel, patches)

@@ -199,6 +199,58 @@ def make_direct(order: int) -> SimpleNamespace:
                 glossy *= share
         return diffuse, glossy
 
+    @wp.func
+    def receive(
+        world: int,
+        receiver: int,
+        receivers: ReceiverTable,
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
+        cuts: CutTables,
+    ):
+        """Irradiance and radiance through the normalised Phong lobe of the environment and the area lights."""
+        surface = surface_of(world, receiver, receivers, geometry, poses, lighting)
+        p = surface.position
+        n = surface.normal
+        own = surface.entity
+        rows = o[0].rows[world, own]
+        transfer = transfer_of(surface, rows, lighting, o)
+
+        lights = lighting[0].light_entity.shape[0]
+        shining = int(-1)
+        if lights > 0:
+            shining = lighting[0].light_entity[0]
+        facing = facing_of(world, 0, poses, lighting)
+        visible, before = kit.visibility_at(world, receiver, own, shining, facing, p, n, geometry, poses, o, cuts)
+        diffuse = environment_light(world, wp.cw_mul(visible, transfer), lighting)
+        glossy = wp.vec3()
+        lobe = values()
+        if wp.max(geometry[0].specular[own]) > 0.0:
+            # The transfer brings the cosine that the lobe is normalised for, and what the body hides from itself.
+            if surface.first_gloss >= 0:
+                lobe = kit.at_directions(stored_at(lighting[0].gloss, surface.first_gloss, surface), rows)
+            else:
+                lobe = kit.zonal_at_directions(lighting[0].lobe[own], surface.mirrored, o[0].quadrature)
+                lobe = wp.cw_mul(lobe, transfer)
+            glossy = environment_light(world, wp.cw_mul(visible, lobe), lighting)
+
+        open_share = open_to_self(surface, rows, lighting, o)
+        for light in range(lights):
+            if light > 0:
+                shining = lighting[0].light_entity[light]
+                facing = facing_of(world, light, poses, lighting)
+                _visible, before = kit.visibility_at(
+                    world, receiver, own, shining, facing, p, n, geometry, poses, o, cuts
+                )
+            passed = wp.cw_mul(before, open_share)
+            irradiance, gloss = area_light(world, light, surface, passed, lobe, geometry, poses, o, lighting)
+            diffuse += irradiance * lighting[0].light_radiance[world, light]
+            glossy += gloss * lighting[0].light_radiance[world, light]
+        # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
+        return wp.max(diffuse, wp.vec3()), wp.max(glossy, wp.vec3())
+
     @wp.kernel(enable_backward=False, module="unique")
     def shade_receivers(
         first: int,
@@ -215,50 +267,12 @@ def make_direct(order: int) -> SimpleNamespace:
     ):
         world, receiver = wp.tid()
         receiver += first
-        entity = receivers.entity[world, receiver]
-        if entity < 0 or turns[world, receiver] != turn:
+        if receivers.entity[world, receiver] < 0 or turns[world, receiver] != turn:
             return
-        surface = surface_of(world, receiver, receivers, geometry, poses, lighting)
-        p = surface.position
-        n = surface.normal
-        rows = o[0].rows[world, entity]
-        transfer = transfer_of(surface, rows, lighting, o)
-
-        lights = lighting[0].light_entity.shape[0]
-        shining = int(-1)
-        if lights > 0:
-            shining = lighting[0].light_entity[0]
-        facing = facing_of(world, 0, poses, lighting)
-        visible, before = kit.visibility_at(world, receiver, entity, shining, facing, p, n, geometry, poses, o, cuts)
-        diffuse = environment_light(world, wp.cw_mul(visible, transfer), lighting)
-        glossy = wp.vec3()
-        lobe = values()
-        if wp.max(geometry[0].specular[entity]) > 0.0:
-            # The transfer brings the cosine that the lobe is normalised for, and what the body hides from itself.
-            if surface.first_gloss >= 0:
-                lobe = kit.at_directions(stored_at(lighting[0].gloss, surface.first_gloss, surface), rows)
-            else:
-                lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
-                lobe = wp.cw_mul(lobe, transfer)
-            glossy = environment_light(world, wp.cw_mul(visible, lobe), lighting)
-
-        open_share = open_to_self(surface, rows, lighting, o)
-        for light in range(lights):
-            if light > 0:
-                shining = lighting[0].light_entity[light]
-                facing = facing_of(world, light, poses, lighting)
-                _visible, before = kit.visibility_at(
-                    world, receiver, entity, shining, facing, p, n, geometry, poses, o, cuts
-                )
-            passed = wp.cw_mul(before, open_share)
-            irradiance, gloss = area_light(world, light, surface, passed, lobe, geometry, poses, o, lighting)
-            diffuse += irradiance * lighting[0].light_radiance[world, light]
-            glossy += gloss * lighting[0].light_radiance[world, light]
-
-        # Band-limited light has negative lobes; what adds up to less than nothing is nothing.
-        zero = wp.vec3()
-        diffuse_out[world, receiver] = wp.max(diffuse, zero)
-        glossy_out[world, receiver] = wp.max(glossy, zero)
+        # In a function of its own: a kernel sets all of its vectors to zero before it looks whose turn it is.
+        diffuse, glossy = receive(world, receiver, receivers, geometry, poses, o, lighting, cuts)
+        diffuse_out[world, receiver] = diffuse
+        glossy_out[world, receiver] = glossy
 
     return SimpleNamespace(
         **vars(kit),

@@ -123,47 +123,54 @@ def make_incident(order: int, functions: int) -> SimpleNamespace:
             if patches[0].first_face[own] >= 0:
                 gain[place] = between.horizon_gain(covered, n, lighting[0].weights[0], o[0].quadrature)
         incident = kit.rgb_values()
+        # What is accumulated is not changed under a condition, where a compiler would copy it at every branch.
         for place in range(sources.count):
             source = entity_at[place]
-            if bodies.field[source] >= 0:
-                passed = values(gain[place] * weight[place])
+            if bodies.field[source] < 0:
+                continue
+            passed = values(gain[place] * weight[place])
+            for other in range(sources.count):
+                share = float(0.0)
+                if other != place:
+                    share = overlap(toward[other], sine[other], toward[place], sine[place])
+                if share > 0.0:
+                    further = (distance[place] - distance[other]) / (radius[place] + radius[other])
+                    share *= hides_body(world, entity_at[other], ahead[other], source, further, patches, relations)
+                if share <= 0.0:
+                    continue
+                passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+            p_body = wp.transpose(poses[0].rotation[world, source]) * (p - poses[0].position[world, source])
+            where = radiant.locate(fields, bodies.field[source], p_body)
+            rgb = radiant.lookup_summed(summed[world], summed_first[source], where)
+            rows = o[0].rows[world, source]
+            incident = add_vectors(incident, rgb, rows, passed)
+            row = gloss.row[source]
+            for axis in range(wp.where(row >= 0, 3, 0)):
+                rgb = radiant.lookup_summed(along[world], along_first[3 * row + axis], where)
+                # Light leaves against the direction in which it is seen.
+                passed_along = kit.along_axis(passed, axis, o[0].quadrature)
+                incident = add_vectors(incident, rgb, rows, -passed_along)
+        for place in range(sources.count):
+            source = entity_at[place]
+            if patches[0].first_face[source] < 0:
+                continue
+            to_slab = slab_from_world(world, source, poses, patches)
+            p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
+            for side in range(6):
+                face = patches[0].first_face[source] + side
+                if not patch.sees_face(world, face, p_slab, patches):
+                    continue
+                passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o[0].quadrature)
+                passed = weight[place] * passed
                 for other in range(sources.count):
+                    share = float(0.0)
                     if other != place:
-                        share = overlap(toward[other], sine[other], toward[place], sine[place])
-                        if share > 0.0:
-                            further = (distance[place] - distance[other]) / (radius[place] + radius[other])
-                            share *= hides_body(
-                                world, entity_at[other], ahead[other], source, further, patches, relations
-                            )
-                        if share > 0.0:
-                            passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                p_body = wp.transpose(poses[0].rotation[world, source]) * (p - poses[0].position[world, source])
-                where = radiant.locate(fields, bodies.field[source], p_body)
-                rgb = radiant.lookup_summed(summed[world], summed_first[source], where)
-                rows = o[0].rows[world, source]
-                incident = add_vectors(incident, rgb, rows, passed)
-                row = gloss.row[source]
-                if row >= 0:
-                    for axis in range(3):
-                        rgb = radiant.lookup_summed(along[world], along_first[3 * row + axis], where)
-                        # Light leaves against the direction in which it is seen.
-                        passed_along = kit.along_axis(passed, axis, o[0].quadrature)
-                        incident = add_vectors(incident, rgb, rows, -passed_along)
-            elif patches[0].first_face[source] >= 0:
-                to_slab = slab_from_world(world, source, poses, patches)
-                p_slab = to_slab * (p - slab_origin(world, source, poses, patches))
-                for side in range(6):
-                    face = patches[0].first_face[source] + side
-                    if patch.sees_face(world, face, p_slab, patches):
-                        passed = patch.face_coverage(world, face, p_slab, to_slab, patches, o[0].quadrature)
-                        passed = weight[place] * passed
-                        for other in range(sources.count):
-                            if other != place:
-                                share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
-                                if share > 0.0:
-                                    passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
-                        radiance = patch.face_radiance(world, face, p_slab, n, to_slab, patches, o[0].quadrature)
-                        incident = add_products(incident, radiance, passed)
+                        share = hides_face(world, entity_at[other], ahead[other], face, patches, relations)
+                    if share <= 0.0:
+                        continue
+                    passed = wp.cw_mul(passed, values(1.0) - share * covers[other])
+                radiance = patch.face_radiance(world, face, p_slab, n, to_slab, patches, o[0].quadrature)
+                incident = add_products(incident, radiance, passed)
         for channel in range(3):
             weighted = weigh_channel(incident, channel, lighting[0].weights[0])
             light_out[probe, channel] = to_sh(world, own, weighted, o, lighting, wide_rows)

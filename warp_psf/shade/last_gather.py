@@ -38,44 +38,34 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
     OcclusionTables, LightingTables = kit.OcclusionTables, kit.LightingTables
     cell_of, irradiance_of = kit.cell_of, kit.irradiance_of
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def receive_incident(
-        first: int,
+    @wp.func
+    def receive(
+        world: int,
+        slot: int,
+        pixel: int,
         probes: ProbeTable,
         receivers: ReceiverTable,
-        pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
         geometry: GeometryTables,
         poses: PoseTables,
         o: OcclusionTables,
         lighting: LightingTables,
         wide_rows: wp.array(dtype=half_values),
-        light: wp.array2d(dtype=wide),  # (probe, channel): bounced
-        sky: wp.array2d(dtype=wide),  # (probe, channel): of the environment, or empty
-        own_first: wp.array(dtype=wp.int32),  # (entity): first of `own_light`, -1 for convex bodies
-        own_light: wp.array2d(dtype=wp.vec3),  # (world, vertex): irradiance from the body itself
-        turns: wp.array2d(dtype=wp.int32),  # (world, slot)
-        diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance
-        glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot): radiance through the normalised Phong lobe
-        sky_diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot): likewise of the sky, where there is one
-        sky_glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot)
+        light: wp.array2d(dtype=wide),
+        sky: wp.array2d(dtype=wide),
+        own_first: wp.array(dtype=wp.int32),
+        own_light: wp.array2d(dtype=wp.vec3),
     ):
-        world, slot = wp.tid()
-        slot += first
-        entity = receivers.entity[world, slot]
-        if entity < 0 or turns[world, slot] == wp.static(INTERPOLATED):
-            return
-        pixel = pixel_of[world, slot]
-        if pixel < 0:
-            return
+        """Irradiance and radiance through the normalised Phong lobe of bounced light, and likewise of the sky."""
         surface = kit.surface_of(world, slot, receivers, geometry, poses, lighting)
+        own = surface.entity
         response = kit.response_of(world, surface, poses, lighting)
-        is_glossy = wp.max(geometry[0].specular[entity]) > wp.static(LEAST_SHINE)
+        is_glossy = wp.max(geometry[0].specular[own]) > wp.static(LEAST_SHINE)
         shine = wide()
         if is_glossy:
-            transfer = kit.transfer_of(surface, o[0].rows[world, entity], lighting, o)
-            lobe = kit.zonal_at_directions(lighting[0].lobe[entity], surface.mirrored, o[0].quadrature)
+            transfer = kit.transfer_of(surface, o[0].rows[world, own], lighting, o)
+            lobe = kit.zonal_at_directions(lighting[0].lobe[own], surface.mirrored, o[0].quadrature)
             weighted = wp.cw_mul(wp.cw_mul(lobe, transfer), lighting[0].weights[0])
-            shine = kit.to_sh(world, entity, weighted, o, lighting, wide_rows)
+            shine = kit.to_sh(world, own, weighted, o, lighting, wide_rows)
         corners = wp.vec4i(-1, -1, -1, -1)
         weights = wp.vec4()
         total = float(1.0)
@@ -104,8 +94,8 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
                     glossy += share * irradiance_of(light, corners[place], shine)
                     if has_sky:
                         glossy_from_sky += share * irradiance_of(sky, corners[place], shine)
-        if own_first[entity] >= 0:
-            corner = surface.corners + wp.vec3i(own_first[entity])
+        if own_first[own] >= 0:
+            corner = surface.corners + wp.vec3i(own_first[own])
             u = surface.uv[0]
             v = surface.uv[1]
             from_itself = u * own_light[world, corner[0]] + v * own_light[world, corner[1]]
@@ -116,11 +106,59 @@ def make_last_bounce(order: int, functions: int) -> SimpleNamespace:
         if not is_glossy:
             glossy = diffuse / wp.pi
             glossy_from_sky = from_sky / wp.pi
-        diffuse_out[world, slot] = wp.max(diffuse, wp.vec3())
-        glossy_out[world, slot] = wp.max(glossy, wp.vec3())
-        if has_sky:
-            sky_diffuse_out[world, slot] = wp.max(from_sky, wp.vec3())
-            sky_glossy_out[world, slot] = wp.max(glossy_from_sky, wp.vec3())
+        dark = wp.vec3()
+        return wp.max(diffuse, dark), wp.max(glossy, dark), wp.max(from_sky, dark), wp.max(glossy_from_sky, dark)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def receive_incident(
+        first: int,
+        probes: ProbeTable,
+        receivers: ReceiverTable,
+        pixel_of: wp.array2d(dtype=wp.int32),  # (world, slot)
+        geometry: GeometryTables,
+        poses: PoseTables,
+        o: OcclusionTables,
+        lighting: LightingTables,
+        wide_rows: wp.array(dtype=half_values),
+        light: wp.array2d(dtype=wide),  # (probe, channel): bounced
+        sky: wp.array2d(dtype=wide),  # (probe, channel): of the environment, or empty
+        own_first: wp.array(dtype=wp.int32),  # (entity): first of `own_light`, -1 for convex bodies
+        own_light: wp.array2d(dtype=wp.vec3),  # (world, vertex): irradiance from the body itself
+        turns: wp.array2d(dtype=wp.int32),  # (world, slot)
+        diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot): irradiance
+        glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot): radiance through the normalised Phong lobe
+        sky_diffuse_out: wp.array2d(dtype=wp.vec3),  # (world, slot): likewise of the sky, where there is one
+        sky_glossy_out: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    ):
+        world, slot = wp.tid()
+        slot += first
+        if receivers.entity[world, slot] < 0 or turns[world, slot] == wp.static(INTERPOLATED):
+            return
+        pixel = pixel_of[world, slot]
+        if pixel < 0:
+            return
+        # In a function of its own: a kernel sets all of its vectors to zero before it looks whose turn it is.
+        diffuse, glossy, from_sky, glossy_from_sky = receive(
+            world,
+            slot,
+            pixel,
+            probes,
+            receivers,
+            geometry,
+            poses,
+            o,
+            lighting,
+            wide_rows,
+            light,
+            sky,
+            own_first,
+            own_light,
+        )
+        diffuse_out[world, slot] = diffuse
+        glossy_out[world, slot] = glossy
+        if sky.shape[0] > 0:
+            sky_diffuse_out[world, slot] = from_sky
+            sky_glossy_out[world, slot] = glossy_from_sky
 
     return SimpleNamespace(**vars(kit), receive_incident=receive_incident)
 
