@@ -12,6 +12,7 @@ that is like it, and EXTRA_GROUPS further slots belong to each edge pixel, in th
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warp_psf.device import launch
@@ -277,6 +278,13 @@ def aim(surfaces: Surfaces, cameras: list[Camera]) -> None:
     write_cameras(surfaces.camera, cameras)
 
 
+def _most_edges(surfaces: Surfaces) -> int:
+    """The edge pixels of the world that has most of them."""
+    before = surfaces.edge_rank[:, :1].numpy().ravel()
+    last = surfaces.edge_rank[-1:, -1:].numpy().ravel() + surfaces.edge[-1:, -1:].numpy().ravel()
+    return int(np.diff(np.concatenate([before, last])).max())
+
+
 def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> None:
     """Fills `surfaces` with what the camera sees of the scene in its present poses."""
     camera, receivers, tiles = surfaces.camera, surfaces.receivers, surfaces.tiles
@@ -286,14 +294,17 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     views = [scene.geometry, scene.poses, camera, tiles, surfaces.back]
     drawn = [surfaces.raster.faces.first, surfaces.raster.drawn]
     launch(_trace_centers, dim, [*views, *drawn, receivers], [surfaces.edge], device)
+    pixels = dim[1]
+    receivers.count = pixels
     if surfaces.edge_capacity == 0:
         surfaces.extra.fill_(-1)
         return
     if surfaces.antialias:
         launch(_add_edges, dim, [camera, receivers], [surfaces.edge], device)
     wp.utils.array_scan(surfaces.edge.flatten(), surfaces.edge_rank.flatten(), inclusive=False)
-    # What an earlier frame left in slots that this frame's edges do not reach.
-    receivers.entity[:, dim[1] :].fill_(-1)
+    receivers.count += EXTRA_GROUPS * min(_most_edges(surfaces), surfaces.edge_capacity)
+    # What an earlier frame left there.
+    receivers.entity[:, pixels:].fill_(-1)
     samples = SAMPLES if surfaces.antialias else 1
     inputs = [*views, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, surfaces.none_known]
     inputs += [samples, receivers]

@@ -14,6 +14,7 @@ class ReceiverTable:
     normal: wp.array2d(dtype=wp.vec3)  # world, unit; a pixel's is turned towards the viewer
     depth: wp.array2d(dtype=wp.float32)  # metres along the optical axis
     weight: wp.array2d(dtype=wp.float32)  # share of its pixel
+    count: wp.int32  # slots of each world that are in use, the first ones
 
 
 def make_receivers(shape: tuple[int, int], device: wp.Device) -> ReceiverTable:
@@ -26,4 +27,10 @@ def make_receivers(shape: tuple[int, int], device: wp.Device) -> ReceiverTable:
     receivers.normal = wp.zeros(shape, dtype=wp.vec3, device=device)
     receivers.depth = wp.zeros(shape, dtype=wp.float32, device=device)
     receivers.weight = wp.zeros(shape, dtype=wp.float32, device=device)
+    receivers.count = shape[1]
     return receivers
+
+
+def in_use(receivers: ReceiverTable) -> tuple[int, int]:
+    """Worlds, and the slots of each that are in use."""
+    return receivers.entity.shape[0], receivers.count

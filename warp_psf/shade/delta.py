@@ -11,7 +11,7 @@ from warp_psf.basis import sphere
 from warp_psf.device import launch
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, may_hit
 from warp_psf.scene.light import DeltaLight
-from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.receiver import ReceiverTable, in_use
 from warp_psf.scene.scene import Scene
 
 # Shadow rays towards a bulb with a radius. When the first few, spread over the bulb, agree, the rest are left out.
@@ -311,4 +311,4 @@ def add_delta_lights(
     if lights.table.kind.shape[1] == 0:
         return
     inputs = [receivers, scene.geometry, scene.poses, lights.opacity, eye, lights.table, lights.far]
-    launch(_add_delta_lights, diffuse.shape, inputs, [diffuse, glossy], device)
+    launch(_add_delta_lights, in_use(receivers), inputs, [diffuse, glossy], device)

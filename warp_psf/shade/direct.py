@@ -13,7 +13,7 @@ from warp_psf.basis.directions import basis_at_directions, quadrature_weights
 from warp_psf.device import launch, upload_tables
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, find_placed
 from warp_psf.scene.mesh import Mesh
-from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.receiver import ReceiverTable, in_use
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.area import make_area
 from warp_psf.shade.occlude import make_occlude
@@ -390,7 +390,7 @@ def shade_direct(
     """
     kit = make_direct(lighting.order)
     inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.tables, lighting.tables, cuts]
-    launch(kit.shade_receivers, diffuse.shape, inputs, [diffuse, glossy], device)
+    launch(kit.shade_receivers, in_use(receivers), inputs, [diffuse, glossy], device)
 
 
 def facing_of(mesh: Mesh) -> np.ndarray:

@@ -15,7 +15,7 @@ import warp as wp
 from warp_psf.device import launch
 from warp_psf.field.radiance import sum_fields
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
-from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.receiver import ReceiverTable, in_use
 from warp_psf.shade.bounce import BounceState
 from warp_psf.shade.contacts import BESIDE_KINK, BY_PROBES, ON_CONTACT, settle_contacts, touches
 from warp_psf.shade.direct import DirectState, shade_direct
@@ -348,12 +348,12 @@ def gather_last_bounce(
         _gather_chosen(gather, extra.shape[1], *around, device)
     launch(
         kit.choose_unserved,
-        gather.chosen.shape,
+        in_use(pixels),
         [table, pixels, gather.pixel_of, gather.gathers_sky, lattice.turns],
         [gather.chosen],
         device,
     )
-    _gather_chosen(gather, gather.chosen.shape[1], *around, device)
+    _gather_chosen(gather, pixels.count, *around, device)
 
     inputs = [table, pixels, gather.pixel_of, scene.geometry, scene.poses]
     inputs += [
@@ -366,30 +366,30 @@ def gather_last_bounce(
         state.own_light,
         lattice.turns,
     ]
-    launch(kit.receive_incident, gather.chosen.shape, inputs, [*bounced, *gather.sky_received], device)
-    interpolate_lattice(lattice, pixels, *bounced, device)
+    launch(kit.receive_incident, in_use(pixels), inputs, [*bounced, *gather.sky_received], device)
     if gather.gathers_sky:
-        _finish_sky(gather, pixels, scene, occlusion, lighting, cuts, lattice, device)
-        launch(_add_light, gather.chosen.shape, [pixels, *gather.sky_received], list(direct), device)
+        _settle_sky(gather, *around, device)
+    interpolate_lattice(lattice, pixels, bounced, gather.sky_received, device)
+    if gather.gathers_sky:
+        # Last, as interpolation would spread what is seen beside kinks.
+        shade_direct(pixels, gather.looks_up, BESIDE_KINK, *around[1:], *gather.sky_received, device)
+        launch(_add_light, in_use(pixels), [pixels, *gather.sky_received], list(direct), device)
 
 
-def _finish_sky(
+def _settle_sky(
     gather: LastGather,
     pixels: ReceiverTable,
     scene: DeviceScene,
     occlusion: OcclusionState,
     lighting: DirectState,
     cuts: wp.array,
-    lattice: Lattice,
     device: wp.Device,
 ) -> None:
-    """Brings the sky's light to where probes have not: to contacts, beside kinks, and to interpolated cells."""
+    """Lets receivers on contacts look at the sky themselves, and finds those beside kinks."""
     turns, lights = gather.looks_up, (scene, occlusion, lighting, cuts)
     shade_direct(pixels, turns, ON_CONTACT, *lights, *gather.own_sky, device)
-    inputs = [pixels, gather.pixel_of, lattice.width, *gather.own_sky]
-    launch(settle_contacts, turns.shape, inputs, [turns, *gather.sky_received], device)
-    interpolate_lattice(lattice, pixels, *gather.sky_received, device)
-    shade_direct(pixels, turns, BESIDE_KINK, *lights, *gather.sky_received, device)
+    inputs = [pixels, gather.pixel_of, gather.table.width, *gather.own_sky]
+    launch(settle_contacts, in_use(pixels), inputs, [turns, *gather.sky_received], device)
 
 
 def _gather_chosen(
@@ -405,13 +405,15 @@ def _gather_chosen(
     """Makes probes of those of the first `slots` slots that are chosen, and gathers their light."""
     state = gather.bounces
     kit = make_last_bounce(state.order, state.functions)
-    chosen, rank = gather.chosen.flatten(), gather.rank.flatten()
+    worlds, room = gather.chosen.shape
+    # All that may be chosen, and what lies between two worlds.
+    length = (worlds - 1) * room + slots
+    chosen, rank = gather.chosen.flatten()[:length], gather.rank.flatten()[:length]
     wp.utils.array_scan(chosen, rank, inclusive=False)
     fresh = int(rank[-1:].numpy()[0] + chosen[-1:].numpy()[0])
     if fresh == 0:
         return
-    dim = (gather.chosen.shape[0], slots)
-    launch(_number_probes, dim, [gather.chosen, gather.rank, gather.count, gather.table], [], device)
+    launch(_number_probes, (worlds, slots), [gather.chosen, gather.rank, gather.count, gather.table], [], device)
     if gather.count + fresh > gather.light.shape[0]:
         gather.light = _enlarge(gather.light, 2 * (gather.count + fresh))
         if gather.gathers_sky:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.receiver import ReceiverTable, in_use
 
 # Spacings of the lattice, pixels, coarse to fine; a receiver is shaded in the turn of its spacing.
 STRIDES = (4, 2, 1)
@@ -215,6 +215,8 @@ def _interpolate(
     turns: wp.array2d(dtype=wp.int32),  # (world, slot)
     diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot)
     glossy: wp.array2d(dtype=wp.vec3),  # (world, slot)
+    sky_diffuse: wp.array2d(dtype=wp.vec3),  # (world, slot), or empty
+    sky_glossy: wp.array2d(dtype=wp.vec3),  # (world, slot), or empty
 ):
     world, pixel = wp.tid()
     pixel += first
@@ -239,6 +241,9 @@ def _interpolate(
     corner = x - x % stride + (y - y % stride) * width
     diffuse[world, pixel] = blend_corners(diffuse, world, corner, stride, width, x % stride, y % stride)
     glossy[world, pixel] = blend_corners(glossy, world, corner, stride, width, x % stride, y % stride)
+    if sky_diffuse.shape[1] > 0:
+        sky_diffuse[world, pixel] = blend_corners(sky_diffuse, world, corner, stride, width, x % stride, y % stride)
+        sky_glossy[world, pixel] = blend_corners(sky_glossy, world, corner, stride, width, x % stride, y % stride)
 
 
 def make_lattice(worlds: int, slots: int, width: int, height: int, device: wp.Device) -> Lattice:
@@ -248,7 +253,7 @@ def make_lattice(worlds: int, slots: int, width: int, height: int, device: wp.De
 
 def begin_lattice(lattice: Lattice, receivers: ReceiverTable, extra: wp.array, device: wp.Device) -> None:
     """Gives the first turn to every fourth pixel and to edges. extra: int32 (world, pixel), not -1 on edge pixels."""
-    launch(_begin, lattice.turns.shape, [receivers, extra, lattice.width], [lattice.turns], device)
+    launch(_begin, in_use(receivers), [receivers, extra, lattice.width], [lattice.turns], device)
 
 
 def refine_lattice(
@@ -262,10 +267,17 @@ def refine_lattice(
 
 
 def interpolate_lattice(
-    lattice: Lattice, receivers: ReceiverTable, diffuse: wp.array, glossy: wp.array, device: wp.Device
+    lattice: Lattice,
+    receivers: ReceiverTable,
+    bounced: tuple[wp.array, wp.array],
+    sky: tuple[wp.array, wp.array],
+    device: wp.Device,
 ) -> None:
-    """Interpolates other values in the cells in which a refined lattice was interpolated."""
+    """Interpolates other light in the cells in which a refined lattice was interpolated; both vec3 (world, slot).
+
+    sky: empty where probes do not bring it.
+    """
     dim = (lattice.turns.shape[0], lattice.width * lattice.height)
     for stride in STRIDES[:-1]:
-        inputs = [receivers, lattice.width, lattice.height, stride, lattice.turns, diffuse, glossy]
+        inputs = [receivers, lattice.width, lattice.height, stride, lattice.turns, *bounced, *sky]
         launch(_interpolate, dim, inputs, [], device)

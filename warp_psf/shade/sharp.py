@@ -19,7 +19,7 @@ from warp_psf.field.silhouettes import SilhouetteField, own_distance, upload_sil
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, find_placed
 from warp_psf.scene.leaves import Leaves, cut_light, merge_leaves
 from warp_psf.scene.light import AreaLight
-from warp_psf.scene.receiver import ReceiverTable
+from warp_psf.scene.receiver import ReceiverTable, in_use
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.area import make_area
 from warp_psf.shade.direct import DirectState, facing_of, make_direct
@@ -359,7 +359,7 @@ def add_sharp_light(
     if state.is_empty:
         return
     inputs = [receivers, turns, turn, scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.tables]
-    launch(make_sharp(state.order).add_sharp, diffuse.shape, inputs, [diffuse, glossy], device)
+    launch(make_sharp(state.order).add_sharp, in_use(receivers), inputs, [diffuse, glossy], device)
 
 
 def add_sharp_moments(
