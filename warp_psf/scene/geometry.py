@@ -74,6 +74,33 @@ def find_placed(world: int, entity: int, geometry: GeometryTables, poses: PoseTa
     return placed
 
 
+@wp.struct
+class Extent:
+    """Where something lies in the world: in the box of three half axes around a centre."""
+
+    center: wp.vec3
+    axes: wp.mat33  # in columns
+
+
+@wp.func
+def extent_of(world: int, entity: int, geometry: GeometryTables, poses: PoseTables) -> Extent:
+    """An entity's bounding box: its sphere would reach below the floor on which it stands."""
+    lower = geometry[0].lower[entity]
+    upper = geometry[0].upper[entity]
+    rotation = poses[0].rotation[world, entity]
+    extent = Extent()
+    extent.center = poses[0].position[world, entity] + rotation * (0.5 * (lower + upper))
+    extent.axes = rotation * wp.diag(0.5 * (upper - lower))
+    return extent
+
+
+@wp.func
+def reach_of(extent: Extent, n: wp.vec3) -> float:
+    """How far an extent reaches from its centre along a direction, metres."""
+    along = wp.transpose(extent.axes) * n
+    return wp.abs(along[0]) + wp.abs(along[1]) + wp.abs(along[2])
+
+
 @wp.func
 def may_hit(geometry: GeometryTables, entity: int, origin: wp.vec3, direction: wp.vec3, farthest: float) -> bool:
     """Whether a ray in the entity's frame meets its bounding box before `farthest`, in units of `direction`."""

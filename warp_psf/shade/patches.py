@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.device import launch, upload_tables
-from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, extent_of, reach_of
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.occluders import OcclusionState
@@ -100,14 +100,16 @@ def slab_origin(world: int, entity: int, poses: PoseTables, patches: PatchTables
 
 
 @wp.func
-def reach_along(
+def top_along(
     n: wp.vec3, world: int, entity: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables
 ) -> float:
-    """How far a body reaches from its centre along a direction of the world: a slab's box, any other's sphere."""
+    """How far an entity's box reaches along a direction of the world, metres."""
     if patches[0].first_face[entity] < 0:
-        return geometry[0].radius[entity]
+        extent = extent_of(world, entity, geometry, poses)
+        return wp.dot(n, extent.center) + reach_of(extent, n)
     n_slab = slab_from_world(world, entity, poses, patches) * n
-    return wp.dot(wp.vec3(wp.abs(n_slab[0]), wp.abs(n_slab[1]), wp.abs(n_slab[2])), patches[0].slab_half[entity])
+    reach = wp.dot(wp.vec3(wp.abs(n_slab[0]), wp.abs(n_slab[1]), wp.abs(n_slab[2])), patches[0].slab_half[entity])
+    return wp.dot(n, slab_origin(world, entity, poses, patches)) + reach
 
 
 @wp.func
@@ -210,8 +212,8 @@ def _focus_faces(first: int, geometry: GeometryTables, poses: PoseTables, patche
         if patches[0].opacity[entity] > 0.0 and entity != own:
             position = poses[0].position[world, entity] + poses[0].rotation[world, entity] * geometry[0].center[entity]
             p = to_slab * (position - origin)
-            rise = reach_along(n_world, world, entity, geometry, poses, patches)
-            if wp.dot(n, p) + rise > half[2] + wp.static(FACE_HORIZON) * geometry[0].radius[own]:
+            top = top_along(n_world, world, entity, geometry, poses, patches) - wp.dot(n_world, origin)
+            if top > half[2] + wp.static(FACE_HORIZON) * geometry[0].radius[own]:
                 seen = 1
             if patches[0].first_face[entity] < 0:
                 # Bodies with a shape of their own draw the texels to where they are, those far away hardly.

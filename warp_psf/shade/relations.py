@@ -7,7 +7,7 @@ looks at the receiver. Both are shares that change smoothly as the bodies move, 
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
+from warp_psf.scene.geometry import DeviceScene, Extent, GeometryTables, PoseTables, extent_of, reach_of
 from warp_psf.shade.patches import Patches, PatchTables, axis_vector, slab_from_world, slab_origin
 
 # The least half-extent over which a body passes through a plane, in units of its half-diagonal: a flat one is on one
@@ -24,26 +24,6 @@ class RelationTable:
     behind: wp.array3d(dtype=wp.float32)
 
 
-@wp.struct
-class Extent:
-    """Where something lies in the world: in the box of three half axes around a centre."""
-
-    center: wp.vec3
-    axes: wp.mat33  # in columns
-
-
-@wp.func
-def extent_of(world: int, entity: int, geometry: GeometryTables, poses: PoseTables) -> Extent:
-    """An entity's bounding box: its sphere would reach below the floor on which it stands."""
-    lower = geometry[0].lower[entity]
-    upper = geometry[0].upper[entity]
-    rotation = poses[0].rotation[world, entity]
-    extent = Extent()
-    extent.center = poses[0].position[world, entity] + rotation * (0.5 * (lower + upper))
-    extent.axes = rotation * wp.diag(0.5 * (upper - lower))
-    return extent
-
-
 @wp.func
 def extent_of_face(world: int, face: int, poses: PoseTables, patches: PatchTables) -> Extent:
     """The part of a face that sends out light."""
@@ -58,13 +38,6 @@ def extent_of_face(world: int, face: int, poses: PoseTables, patches: PatchTable
     extent.center = slab_origin(world, entity, poses, patches) + to_world * middle
     extent.axes = to_world * wp.diag(part[1] * u + part[3] * v)
     return extent
-
-
-@wp.func
-def reach_of(extent: Extent, n: wp.vec3) -> float:
-    """How far an extent reaches from its centre along a direction, metres."""
-    along = wp.transpose(extent.axes) * n
-    return wp.abs(along[0]) + wp.abs(along[1]) + wp.abs(along[2])
 
 
 @wp.func
