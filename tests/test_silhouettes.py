@@ -18,6 +18,7 @@ from warp_psf.field.silhouettes import (
     find_silhouette,
     map_frames,
     own_distance,
+    own_frame,
     silhouette_distance,
     upload_silhouettes,
 )
@@ -49,7 +50,7 @@ def _look_at_self(
 ):
     _world, item = wp.tid()
     item += first
-    distance_out[item] = own_distance(tables, vertex, normal, directions[item])
+    distance_out[item] = own_distance(tables, vertex, own_frame(normal) * directions[item])
 
 
 @wp.kernel(enable_backward=False, module="unique")

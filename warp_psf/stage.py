@@ -45,7 +45,14 @@ from warp_psf.shade.lattice import STRIDES, Lattice, begin_lattice, make_lattice
 from warp_psf.shade.occluders import OcclusionState, turn_occlusion, upload_occlusion
 from warp_psf.shade.proxies import upload_bounces
 from warp_psf.shade.receivers import VertexReceivers, interpolate_vertices, place_vertices, upload_vertices
-from warp_psf.shade.sharp import SharpState, add_sharp_light, add_sharp_moments, upload_sharp, write_leaves
+from warp_psf.shade.sharp import (
+    SharpState,
+    add_sharp_light,
+    add_sharp_moments,
+    place_sharp,
+    upload_sharp,
+    write_leaves,
+)
 from warp_psf.shade.spheres import SphereState, carry_spheres, choose_cuts, make_cuts, upload_spheres
 from warp_psf.shade.tint import tint_proxies
 
@@ -271,6 +278,8 @@ def draw(stage: Stage) -> None:
             find_transfer(stage.hemispheres, surfaces.receivers, scene, stage.lighting, device)
     with _timed(stage, "turn fields"):
         turn_occlusion(stage.occlusion, scene, device)
+        if stage.sharp is not None:
+            place_sharp(stage.sharp, scene, device)
     if stage.vertices is None or stage.vertices_received is None:
         _shade_pixels(stage)
     else:

@@ -281,20 +281,26 @@ def silhouette_distance(tables: SilhouetteTables, seen: Silhouette, direction: w
 
 
 @wp.func
-def own_distance(tables: SilhouetteTables, vertex: int, normal: wp.vec3, direction: wp.vec3) -> float:
-    """The angle from a direction to what the body itself hides from a vertex, radians, above zero where it does.
-
-    vertex: of those of `own`; normal: its unit normal, in the body's frame as the direction, which is above it.
-    """
+def own_frame(normal: wp.vec3) -> wp.mat33:
+    """The frame of the map of a vertex with that unit normal: two axes and the normal, as rows."""
     level = wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1])
     # The frame of `map_frames` for a vertex that looks along its normal.
     cos_phi = wp.where(level > wp.static(_TINY), -normal[0] / wp.max(level, wp.static(_TINY)), 1.0)
     sin_phi = wp.where(level > wp.static(_TINY), -normal[1] / wp.max(level, wp.static(_TINY)), 0.0)
-    x = -normal[2] * (cos_phi * direction[0] + sin_phi * direction[1]) - level * direction[2]
-    y = cos_phi * direction[1] - sin_phi * direction[0]
-    onto = 1.0 / (wp.sqrt(wp.max(2.0 + 2.0 * wp.dot(normal, direction), 1.0e-6)) * wp.static(OWN_SPREAD))
-    column = wp.clamp((0.5 * x * onto + 0.5) * float(OWN_SIZE) - 0.5, 0.0, float(OWN_SIZE - 1))
-    row = wp.clamp((0.5 * y * onto + 0.5) * float(OWN_SIZE) - 0.5, 0.0, float(OWN_SIZE - 1))
+    return wp.matrix_from_rows(
+        wp.vec3(-normal[2] * cos_phi, -normal[2] * sin_phi, -level), wp.vec3(-sin_phi, cos_phi, 0.0), normal
+    )
+
+
+@wp.func
+def own_distance(tables: SilhouetteTables, vertex: int, local: wp.vec3) -> float:
+    """The angle from a direction to what the body itself hides from a vertex, radians, above zero where it does.
+
+    vertex: of those of `own`; local: the direction in the vertex's `own_frame`, above its horizon.
+    """
+    onto = wp.static(0.5 * OWN_SIZE / OWN_SPREAD) / wp.sqrt(wp.max(2.0 + 2.0 * local[2], 1.0e-6))
+    column = wp.clamp(local[0] * onto + wp.static(0.5 * OWN_SIZE - 0.5), 0.0, float(OWN_SIZE - 1))
+    row = wp.clamp(local[1] * onto + wp.static(0.5 * OWN_SIZE - 0.5), 0.0, float(OWN_SIZE - 1))
     left = wp.min(int(column), OWN_SIZE - 2)
     above = wp.min(int(row), OWN_SIZE - 2)
     a = column - float(left)

@@ -12,9 +12,9 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.visibility_mask import make_masks
 from warp_psf.field.rasterise import draw_all, make_horizon
+from warp_psf.field.silhouette_lanes import lanes, silhouette_distances
 from warp_psf.field.silhouettes import Silhouette, find_silhouette, silhouette_distance
 from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
-from warp_psf.scene.leaves import GROUP
 from warp_psf.shade.coverage import FIELD_SHAPE, SLAB_SHAPE, SPHERE_SHAPE
 from warp_psf.shade.delta import SHADOW_OFFSET, bulb_point
 from warp_psf.shade.fades import Light, horizon_fade
@@ -25,11 +25,12 @@ from warp_psf.shade.penumbra import (
     BoxOutline,
     box_outline,
     disc_share,
+    disc_shares,
     outline_distance,
     part_direction,
     sphere_distance,
 )
-from warp_psf.shade.sources import Group, SharpTables, source_of
+from warp_psf.shade.sources import Group, SharpTables, Sources, direction_to
 
 # Nearer to a body's centre than this many bounding radii its surface may be so near that samples of its field are far
 # apart: edges are then known to this many radians, and where sources are few, rays find them.
@@ -37,7 +38,6 @@ NEAR, NEAR_ERROR = 1.25, 0.1
 FEW_SOURCES = 4
 # Rays to a source; when the first few agree, the rest are left out.
 RAYS, FIRST_RAYS = 16, 4
-shares = wp.types.vector(GROUP, wp.float32)
 
 
 @wp.func
@@ -109,19 +109,18 @@ def make_hiding(order: int) -> SimpleNamespace:
 
     @wp.func
     def hide_by(
-        visible: shares,
-        world: int,
+        visible: lanes,
         entity: int,
         p: wp.vec3,
         placed: Placed,
         n: wp.vec3,
         weight: float,
         group: Group,
+        sources: Sources,
         geometry: GeometryTables,
-        poses: PoseTables,
         o: OcclusionTables,
         s: SharpTables,
-    ) -> shares:
+    ) -> lanes:
         """What an entity leaves visible of the sources of a group."""
         shape = o[0].occluders.shape[entity]
         offset = placed.center - p
@@ -140,34 +139,32 @@ def make_hiding(order: int) -> SimpleNamespace:
         error = float(0.0)
         if shape == wp.static(FIELD_SHAPE) and group.count <= wp.static(FEW_SOURCES):
             error = wp.where(wp.length(offset) < wp.static(NEAR) * placed.radius, wp.static(NEAR_ERROR), 0.0)
-        result = visible
         # First the group as a whole, then each source.
-        source = int(-1)
-        while source < group.count:
-            direction = group.axis
-            radius = group.spread
-            if source >= 0:
-                asked = source_of(world, group, source, p, poses, s)
-                direction = asked.direction
-                radius = asked.radius
+        whole = distance_to(group.axis, shape, offset, placed.radius, to_frame, outline, seen, s)
+        if whole <= -group.spread - error:
+            return visible
+        if whole >= group.spread + error:
+            return (1.0 - weight) * visible
+        if shape == wp.static(FIELD_SHAPE) and group.light >= 0 and error == 0.0:
+            # A light has pieces enough for what is thinner than it.
+            distances = silhouette_distances(s[0].silhouettes, seen, to_frame, sources.toward)
+            return wp.cw_mul(visible, lanes(1.0) - weight * disc_shares(distances, sources.radius))
+        result = visible
+        for k in range(group.count):
+            direction = direction_to(sources, k)
+            radius = sources.radius[k]
             covered = float(0.0)
-            if source >= 0 and error > 0.0:
+            if error > 0.0:
                 origin = p + (wp.static(SHADOW_OFFSET) * placed.radius) * n
                 mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
                 origin = wp.transpose(placed.rotation) * (origin - placed.position)
                 covered = ray_share(mesh, origin, to_frame * direction, radius, placed.radius)
             else:
                 distance = distance_to(direction, shape, offset, placed.radius, to_frame, outline, seen, s)
-                if source < 0:
-                    if distance <= -radius - error:
-                        return visible
-                    if distance >= radius + error:
-                        return (1.0 - weight) * visible
-                elif wp.abs(distance) >= radius:
+                if wp.abs(distance) >= radius:
                     # All of the source is on one side of the silhouette.
                     covered = wp.where(distance > 0.0, 1.0, 0.0)
                 elif group.light >= 0:
-                    # A light has pieces enough for what is thinner than it.
                     covered = disc_share(distance, radius)
                 else:
                     parts = int(wp.static(PARTS))
@@ -175,9 +172,7 @@ def make_hiding(order: int) -> SimpleNamespace:
                         toward = part_direction(direction, radius, part)
                         aside = distance_to(toward, shape, offset, placed.radius, to_frame, outline, seen, s)
                         covered += wp.static(1.0 / PARTS) * disc_share(aside, wp.static(PART_RADIUS) * radius)
-            if source >= 0:
-                result[source] = result[source] * (1.0 - weight * covered)
-            source += 1
+            result[k] = result[k] * (1.0 - weight * covered)
         return result
 
     @wp.func
@@ -192,16 +187,15 @@ def make_hiding(order: int) -> SimpleNamespace:
 
     @wp.func
     def hide_by_spheres(
-        visible: shares,
+        visible: lanes,
         world: int,
         root: int,
         p: wp.vec3,
         weight: float,
         group: Group,
-        poses: PoseTables,
+        sources: Sources,
         o: OcclusionTables,
-        s: SharpTables,
-    ) -> shares:
+    ) -> lanes:
         """What the spheres of a deforming body leave visible of the sources of a group."""
         distance = sphere_set_distance(world, root, p, group.axis, o)
         if distance <= -group.spread:
@@ -210,32 +204,30 @@ def make_hiding(order: int) -> SimpleNamespace:
             return (1.0 - weight) * visible
         result = visible
         for k in range(group.count):
-            source = source_of(world, group, k, p, poses, s)
-            covered = disc_share(sphere_set_distance(world, root, p, source.direction, o), source.radius)
+            covered = disc_share(sphere_set_distance(world, root, p, direction_to(sources, k), o), sources.radius[k])
             result[k] = result[k] * (1.0 - weight * covered)
         return result
 
     @wp.func
     def hide_by_sheet(
-        visible: shares,
+        visible: lanes,
         world: int,
         sheet: int,
         p: wp.vec3,
         n: wp.vec3,
         weight: float,
         group: Group,
+        sources: Sources,
         poses: PoseTables,
         o: OcclusionTables,
-        s: SharpTables,
-    ) -> shares:
+    ) -> lanes:
         """What a deforming sheet leaves visible, as spherical harmonics show it."""
         hidden = draw_all(world, sheet, make_horizon(p, n), o[0].sheets, o[0].masks)
         blocked = blocked_vector(hidden, n, o[0].masks)
         to_entity = wp.transpose(poses[0].rotation[world, o[0].sheet_entity[sheet]])
         result = visible
         for k in range(group.count):
-            source = source_of(world, group, k, p, poses, s)
-            covered = wp.clamp(wp.dot(blocked, evaluate(to_entity * source.direction)), 0.0, 1.0)
+            covered = wp.clamp(wp.dot(blocked, evaluate(to_entity * direction_to(sources, k))), 0.0, 1.0)
             result[k] = result[k] * (1.0 - weight * covered)
         return result
 
@@ -246,11 +238,12 @@ def make_hiding(order: int) -> SimpleNamespace:
         p: wp.vec3,
         n: wp.vec3,
         group: Group,
+        sources: Sources,
         geometry: GeometryTables,
         poses: PoseTables,
         o: OcclusionTables,
         s: SharpTables,
-    ) -> shares:
+    ) -> lanes:
         """Which share of each source of a group is visible past every entity but `own`."""
         light = Light()
         light.radius = -1.0
@@ -259,7 +252,7 @@ def make_hiding(order: int) -> SimpleNamespace:
             light.center = placed.center
             light.radius = placed.radius
             light.facing = poses[0].rotation[world, s[0].light_entity[group.light]] * s[0].light_facing[group.light]
-        visible = shares(1.0)
+        visible = lanes(1.0)
         for entity in range(geometry[0].entity_mesh.shape[0]):
             weight = o[0].occluders.opacity[entity]
             if weight > 0.0 and entity != own:
@@ -268,7 +261,7 @@ def make_hiding(order: int) -> SimpleNamespace:
                     if group.light >= 0:
                         weight *= kit.nearness(entity, p, placed, light, o)
                     if weight > 0.0:
-                        visible = hide_by(visible, world, entity, p, placed, n, weight, group, geometry, poses, o, s)
+                        visible = hide_by(visible, entity, p, placed, n, weight, group, sources, geometry, o, s)
         node = int(0)
         while node < o[0].spheres[0].leaves.shape[0]:
             entity = o[0].spheres[0].entity[node]
@@ -279,7 +272,7 @@ def make_hiding(order: int) -> SimpleNamespace:
                     if group.light >= 0:
                         weight *= kit.nearness(entity, p, placed, light, o)
                     if weight > 0.0:
-                        visible = hide_by_spheres(visible, world, node, p, weight, group, poses, o, s)
+                        visible = hide_by_spheres(visible, world, node, p, weight, group, sources, o)
             node += 2 * o[0].spheres[0].leaves[node] - 1
         for sheet in range(o[0].sheet_entity.shape[0]):
             entity = o[0].sheet_entity[sheet]
@@ -291,7 +284,7 @@ def make_hiding(order: int) -> SimpleNamespace:
                     if group.light >= 0:
                         weight *= kit.nearness(entity, p, placed, light, o)
                     if weight > 0.0:
-                        visible = hide_by_sheet(visible, world, sheet, p, n, weight, group, poses, o, s)
+                        visible = hide_by_sheet(visible, world, sheet, p, n, weight, group, sources, poses, o)
         return visible
 
     @wp.func

@@ -15,7 +15,8 @@ import warp as wp
 
 from warp_psf.basis import sh
 from warp_psf.device import launch, upload_tables
-from warp_psf.field.silhouettes import SilhouetteField, own_distance, upload_silhouettes
+from warp_psf.field.silhouette_lanes import LANES, directions, lanes, own_distances
+from warp_psf.field.silhouettes import SilhouetteField, own_distance, own_frame, upload_silhouettes
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, find_placed
 from warp_psf.scene.leaves import Leaves, cut_light, merge_leaves
 from warp_psf.scene.light import AreaLight
@@ -25,8 +26,43 @@ from warp_psf.shade.area import make_area
 from warp_psf.shade.direct import DirectState, facing_of, make_direct
 from warp_psf.shade.hiding import make_hiding
 from warp_psf.shade.occluders import OcclusionState
-from warp_psf.shade.penumbra import disc_share
-from warp_psf.shade.sources import Group, SharpTable, SharpTables, Source, group_of, source_of
+from warp_psf.shade.penumbra import disc_shares
+from warp_psf.shade.sources import (
+    Group,
+    SharpTable,
+    SharpTables,
+    Sources,
+    direction_to,
+    group_of,
+    pieces,
+    place_pieces,
+    sources_of,
+)
+
+# A piece of a light that the horizon cuts counts by this cosine, so that a light that sets has shares to the end.
+LEAST_COSINE = 1.0e-4
+
+
+def _sum_pieces_snippet() -> str:
+    """C++: what a light's pieces send to a receiver, and what of that arrives."""
+    return f"""
+    float sent[{LANES}], arrived[{LANES}];
+    for (int k = 0; k < {LANES}; ++k) {{
+        const float cosine = n[0] * toward.data[0][k] + n[1] * toward.data[1][k] + n[2] * toward.data[2][k];
+        sent[k] = (cosine > {LEAST_COSINE}f ? cosine : {LEAST_COSINE}f) * solid_angle[k];
+        arrived[k] = sent[k] * visible[k];
+    }}
+    for (int width = {LANES // 2}; width > 0; width /= 2)
+        for (int k = 0; k < width; ++k) {{
+            sent[k] += sent[width + k];
+            arrived[k] += arrived[width + k];
+        }}
+    return wp::vec_t<2, float>(sent[0], arrived[0]);
+    """
+
+
+@wp.func_native(_sum_pieces_snippet())
+def sum_pieces(n: wp.vec3, toward: directions, solid_angle: lanes, visible: lanes) -> wp.vec2: ...
 
 
 @cache
@@ -43,49 +79,64 @@ def make_sharp(order: int) -> SimpleNamespace:
         field = s[0].field[surface.entity]
         return surface.first_transfer >= 0 and field >= 0 and s[0].silhouettes[0].first_own[wp.max(field, 0)] >= 0
 
-    @wp.func
-    def distance_to_self(
-        world: int,
-        surface: Surface,
-        direction: wp.vec3,
-        geometry: GeometryTables,
-        poses: PoseTables,
-        s: SharpTables,
-    ) -> float:
-        """The angle from a direction to what the receiver's own body hides, radians, above zero where it does."""
-        in_body = wp.transpose(poses[0].rotation[world, surface.entity]) * direction
-        first_own = s[0].silhouettes[0].first_own[s[0].field[surface.entity]]
-        first_vertex = geometry[0].first_vertex[geometry[0].entity_mesh[surface.entity]]
-        distance = float(0.0)
-        for corner in range(3):
-            share = 1.0 - surface.uv[0] - surface.uv[1]
-            if corner < 2:
-                share = surface.uv[corner]
-            vertex = surface.corners[corner]
-            normal = geometry[0].normals[first_vertex + vertex]
-            distance += share * own_distance(s[0].silhouettes, first_own + vertex, normal, in_body)
-        return distance
+    @wp.struct
+    class OwnMaps:
+        """What a receiver's body hides from the three vertices around it."""
+
+        vertex: wp.vec3i  # of the silhouettes' `own`
+        share: wp.vec3  # of each vertex in the receiver
+        frame_0: wp.mat33  # from the world into each vertex's frame
+        frame_1: wp.mat33
+        frame_2: wp.mat33
 
     @wp.func
-    def own_share(
+    def own_maps(world: int, surface: Surface, geometry: GeometryTables, poses: PoseTables, s: SharpTables) -> OwnMaps:
+        """The maps of a receiver for which `has_map` holds."""
+        to_body = wp.transpose(poses[0].rotation[world, surface.entity])
+        first_own = s[0].silhouettes[0].first_own[s[0].field[surface.entity]]
+        first_vertex = geometry[0].first_vertex[geometry[0].entity_mesh[surface.entity]]
+        maps = OwnMaps()
+        maps.vertex = surface.corners + wp.vec3i(first_own, first_own, first_own)
+        maps.share = wp.vec3(surface.uv[0], surface.uv[1], 1.0 - surface.uv[0] - surface.uv[1])
+        maps.frame_0 = own_frame(geometry[0].normals[first_vertex + surface.corners[0]]) * to_body
+        maps.frame_1 = own_frame(geometry[0].normals[first_vertex + surface.corners[1]]) * to_body
+        maps.frame_2 = own_frame(geometry[0].normals[first_vertex + surface.corners[2]]) * to_body
+        return maps
+
+    @wp.func
+    def distance_to_self(maps: OwnMaps, direction: wp.vec3, s: SharpTables) -> float:
+        """The angle from a direction to what the receiver's own body hides, radians, above zero where it does."""
+        silhouettes = s[0].silhouettes
+        distance = maps.share[0] * own_distance(silhouettes, maps.vertex[0], maps.frame_0 * direction)
+        distance += maps.share[1] * own_distance(silhouettes, maps.vertex[1], maps.frame_1 * direction)
+        return distance + maps.share[2] * own_distance(silhouettes, maps.vertex[2], maps.frame_2 * direction)
+
+    @wp.func
+    def open_to_self(
         world: int,
         surface: Surface,
-        source: Source,
-        geometry: GeometryTables,
+        mapped: bool,
+        maps: OwnMaps,
+        group: Group,
+        sources: Sources,
         poses: PoseTables,
         lighting: LightingTables,
         s: SharpTables,
-    ) -> float:
-        """Which share of a source the receiver's own body leaves visible."""
-        if surface.first_transfer < 0:
-            return 1.0
-        if has_map(surface, s):
-            distance = distance_to_self(world, surface, source.direction, geometry, poses, s)
-            return 1.0 - disc_share(distance, source.radius)
+    ) -> lanes:
+        """Which share of each source the receiver's own body, which is not convex, leaves visible."""
+        if mapped:
+            silhouettes = s[0].silhouettes
+            distance = maps.share[0] * own_distances(silhouettes, maps.vertex[0], maps.frame_0, sources.toward)
+            distance += maps.share[1] * own_distances(silhouettes, maps.vertex[1], maps.frame_1, sources.toward)
+            distance += maps.share[2] * own_distances(silhouettes, maps.vertex[2], maps.frame_2, sources.toward)
+            return lanes(1.0) - disc_shares(distance, sources.radius)
         # A body that deforms has no such maps.
-        direction = wp.transpose(poses[0].rotation[world, surface.entity]) * source.direction
+        to_body = wp.transpose(poses[0].rotation[world, surface.entity])
         own = kit.stored_at(lighting[0].self_visibility, surface.first_transfer, surface)
-        return wp.clamp(wp.dot(own, evaluate(direction)), 0.0, 1.0)
+        left = lanes(1.0)
+        for k in range(group.count):
+            left[k] = wp.clamp(wp.dot(own, evaluate(to_body * direction_to(sources, k))), 0.0, 1.0)
+        return left
 
     @wp.struct
     class Received:
@@ -112,12 +163,16 @@ def make_sharp(order: int) -> SimpleNamespace:
         p = surface.position
         n = surface.normal
         alone = bool(False)  # whether the body hides none of the group from itself
-        if has_map(surface, s):
-            distance = distance_to_self(world, surface, group.axis, geometry, poses, s)
+        maps = OwnMaps()
+        mapped = has_map(surface, s)
+        if mapped:
+            maps = own_maps(world, surface, geometry, poses, s)
+            distance = distance_to_self(maps, group.axis, s)
             if distance >= group.spread:
                 return received
             alone = distance <= -group.spread
-        visible = visible_of(world, surface.entity, p, n, group, geometry, poses, o, s)
+        sources = sources_of(world, group, p, s)
+        visible = visible_of(world, surface.entity, p, n, group, sources, geometry, poses, o, s)
         shines = wp.max(geometry[0].specular[surface.entity]) > 0.0
         alone = alone or surface.first_transfer < 0
         if group.light < 0 and alone and not shines and wp.min(visible) == wp.max(visible):
@@ -125,49 +180,42 @@ def make_sharp(order: int) -> SimpleNamespace:
                 # All leaves are above the horizon and alike.
                 received.diffuse += visible[0] * (s[0].moment[world, group.number] * n)
                 return received
+        if not alone:
+            visible = wp.cw_mul(visible, open_to_self(world, surface, mapped, maps, group, sources, poses, lighting, s))
         exponent = geometry[0].exponent[surface.entity]
         result = received
-        if group.light >= 0 and alone and not shines and not with_moments and wp.min(visible) == wp.max(visible):
-            # All pieces are visible by the same share.
-            light = s[0].light_radiance[world, group.light]
-            placed = find_placed(world, s[0].light_entity[group.light], geometry, poses)
-            entity = s[0].light_entity[group.light]
-            whole = area.area_irradiance(
-                entity, p, n, placed.position, placed.rotation, placed.center, placed.radius, o[0].occluders
-            )
-            if whole >= 0.0:
-                result.diffuse += (whole * visible[0]) * light
-                return result
         # Of a light: what its pieces send to here, and what of that arrives.
         sent = float(0.0)
         arrived = float(0.0)
         mirrored_sent = float(0.0)
         mirrored_arrived = float(0.0)
         toward = wp.vec3()
-        for k in range(group.count):
-            source = source_of(world, group, k, p, poses, s)
-            cosine = wp.max(wp.dot(n, source.direction), 0.0)
-            share = visible[k]
-            if not alone:
-                share *= own_share(world, surface, source, geometry, poses, lighting, s)
-            lobe = float(0.0)
-            if shines:
-                aligned = wp.dot(surface.mirrored, source.direction)
-                if aligned > 0.0:
-                    lobe = 0.5 * (exponent + 2.0) / wp.pi * wp.pow(aligned, exponent) * cosine
-            if group.light < 0:
-                light = s[0].sent[world, group.first + k]
-                result.diffuse += (cosine * share) * light
-                result.glossy += (lobe * share) * light
-                result.moment += wp.outer((cosine * share) * light, source.direction)
-            else:
-                # A piece that the horizon cuts counts a little, so that a light that sets has shares to the end.
-                weight = wp.max(cosine, 1.0e-4) * source.solid_angle
-                sent += weight
-                arrived += weight * share
-                mirrored_sent += lobe * source.solid_angle
-                mirrored_arrived += lobe * share * source.solid_angle
-                toward += (weight * share) * source.direction
+        if group.light >= 0 and not shines and not with_moments:
+            both = sum_pieces(n, sources.toward, sources.solid_angle, visible)
+            sent = both[0]
+            arrived = both[1]
+        else:
+            for k in range(group.count):
+                direction = direction_to(sources, k)
+                cosine = wp.max(wp.dot(n, direction), 0.0)
+                share = visible[k]
+                lobe = float(0.0)
+                if shines:
+                    aligned = wp.dot(surface.mirrored, direction)
+                    if aligned > 0.0:
+                        lobe = 0.5 * (exponent + 2.0) / wp.pi * wp.pow(aligned, exponent) * cosine
+                if group.light < 0:
+                    light = s[0].sent[world, group.first + k]
+                    result.diffuse += (cosine * share) * light
+                    result.glossy += (lobe * share) * light
+                    result.moment += wp.outer((cosine * share) * light, direction)
+                else:
+                    weight = wp.max(cosine, wp.static(LEAST_COSINE)) * sources.solid_angle[k]
+                    sent += weight
+                    arrived += weight * share
+                    mirrored_sent += lobe * sources.solid_angle[k]
+                    mirrored_arrived += lobe * share * sources.solid_angle[k]
+                    toward += (weight * share) * direction
         if group.light >= 0 and sent > 0.0:
             entity = s[0].light_entity[group.light]
             placed = find_placed(world, entity, geometry, poses)
@@ -301,11 +349,12 @@ def upload_sharp(
     table.light_radiance = wp.array(np.repeat(radiance, worlds, axis=0), dtype=wp.vec3, device=device)
     facing = np.array([facing_of(light.mesh) for light, _ in lights], np.float32).reshape(-1, 3)
     table.light_facing = wp.array(facing, dtype=wp.vec3, device=device)
-    pieces = [cut_light(light) for light, _ in lights]
-    counts = np.cumsum([0, *(len(each.area) for each in pieces)])
+    cut = [cut_light(light) for light, _ in lights]
+    counts = np.cumsum([0, *(len(each.area) for each in cut)])
+    table.pieces = wp.zeros((worlds, len(lights)), dtype=pieces, device=device)
     table.first_piece = wp.array(counts.astype(np.int32), dtype=wp.int32, device=device)
     for name, dtype, shape in (("position", wp.vec3, (0, 3)), ("normal", wp.vec3, (0, 3)), ("area", wp.float32, (0,))):
-        values = np.concatenate([np.zeros(shape), *(getattr(each, name) for each in pieces)])
+        values = np.concatenate([np.zeros(shape), *(getattr(each, name) for each in cut)])
         setattr(table, name, wp.array(values.astype(np.float32), dtype=dtype, device=device))
     state = SharpState(order, table, upload_tables([table], SharpTable, device))
     return write_leaves(state, merge_leaves([]), worlds, device)
@@ -338,6 +387,11 @@ def _cone_of(direction: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, flo
     axis = direction.sum(axis=0)
     axis /= max(np.linalg.norm(axis), 1e-9)
     return axis, float((np.arccos(np.clip(direction @ axis, -1, 1)) + radius).max())
+
+
+def place_sharp(state: SharpState, scene: DeviceScene, device: wp.Device) -> None:
+    """Brings the sources to where they are in a frame."""
+    place_pieces(state.tables, scene, device)
 
 
 def add_sharp_light(
