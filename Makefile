@@ -3,11 +3,12 @@
 #                   (likewise falling, statues, room, teapots, figure, cloth, chess, sunlit)
 #   make test       the tests            make check    ruff and pyright
 #   make coverage   the tests, and which share of the lines outside kernels they run
+#   make reference  the API reference, from the docstrings of the public names: out/reference/index.html
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: bowling falling statues room teapots figure cloth chess sunlit test coverage check clean
+.PHONY: bowling falling statues room teapots figure cloth chess sunlit test coverage check reference clean
 .DELETE_ON_ERROR:
 
 bowling falling statues room teapots figure cloth chess sunlit: .venv/installed
@@ -23,6 +24,10 @@ check: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+reference: .venv/installed-dev
+	rm -rf out/reference
+	$(BIN)/python docs/reference.py out/reference
 
 # The stamps follow one another, so that `make -j` never runs two installations into one environment.
 .venv/created:

@@ -22,7 +22,7 @@ numbers each; a white matt surface under an even radiance of 1 has the radiance 
 - Files: `FrameSequence`, `to_display`, `read_exr`, `image_difference`.
 - What is precomputed of a shape, for those who study it; a renderer bakes by itself: `bake_mesh`, `BakedBody`,
   `bake_silhouettes`, `bake_wavelet_fields`.
-- Scenes at rest, in which only the light or the viewpoint moves: `freeze_scene`, `area_light`.
+- Scenes at rest, in which only the light or the viewpoint moves: `freeze_scene`, `warp_psf.area_light`.
 """
 
 from importlib import import_module

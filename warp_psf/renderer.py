@@ -52,8 +52,8 @@ class Renderer:
     """Renders a MuJoCo model with soft shadows, frame after frame, without noise.
 
     ```python
-    lamp = psf.rectangle_light("lamp", 1.0, 0.6, radiance=(8, 7, 6), position=(0, -1, 2), target=(0, 0, 0))
-    with psf.Renderer(model, height=120, width=160, environment="sky", lights=[lamp], bounces=2) as renderer:
+    lamp = psf.sphere_light("lamp", 0.1, radiance=(40, 35, 30), position=(1, -1, 2))
+    with psf.Renderer(model, 120, 160, environment="sky", lights=[lamp]) as renderer:
         for _ in range(3):
             mujoco.mj_step(model, data)
             renderer.update_scene(data, camera="front")

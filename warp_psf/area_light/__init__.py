@@ -12,8 +12,9 @@ changed: `make_light_plane`, `LightPlane`, `bake_shadow_slab`, `ShadowSlab`, `ba
 ```python
 A = psf.area_light
 scene = psf.freeze_scene(model, data, cameras=["front", "side"])
-lamp = psf.rectangle_light("lamp", 0.7, 0.7, radiance=(1, 1, 1), position=(0, 0, 1.75), target=(0, 0, 0))
-slab = A.bake_shadow_slab(scene, A.make_light_plane(lamp, rows=9, columns=9), size=65)
+lamp = psf.rectangle_light("lamp", 0.7, 0.7, (1, 1, 1), (0, 0, 2), target=(0, 0, 0))
+plane = A.make_light_plane(lamp, rows=9, columns=9)
+slab = A.bake_shadow_slab(scene, plane, size=65)
 view = A.SlabView(A.bake_scene_map(scene, camera=0, width=160, height=120), [slab])
 view.set_light(0, 20.0 * A.templates.ring(9, 9))
 picture, share = view.picture(), view.attenuation()

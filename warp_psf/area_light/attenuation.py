@@ -44,8 +44,9 @@ class SlabView:
     ```python
     A = psf.area_light
     scene = psf.freeze_scene(model, data, cameras=["front"])
-    lamp = psf.rectangle_light("lamp", 1.0, 1.0, radiance=(1, 1, 1), position=(0, 0, 2), target=(0, 0, 0))
-    slab = A.bake_shadow_slab(scene, A.make_light_plane(lamp, rows=5, columns=5), size=65)
+    lamp = psf.rectangle_light("lamp", 1.0, 1.0, (1, 1, 1), (0, 0, 2), target=(0, 0, 0))
+    plane = A.make_light_plane(lamp, rows=5, columns=5)
+    slab = A.bake_shadow_slab(scene, plane, size=65)
     view = A.SlabView(A.bake_scene_map(scene, width=160, height=120), [slab])
     pictures = []
     for x in (-0.4, 0.0, 0.4):
@@ -89,7 +90,7 @@ class SlabView:
         Args:
             light: the slab's place, counted from 0.
             template: radiance of each sample, linear, [rows, columns] or [rows, columns, 3], at most 1e8; 0 is off. Row
-                0 is the plane's uppermost one. The functions of `area_light.templates` make shapes.
+                0 is the plane's uppermost one. The functions of `warp_psf.area_light.templates` make shapes.
 
         Raises:
             IndexError: there is no such light.

@@ -66,7 +66,7 @@ class PointLists:
         return np.bincount(self.level, sizes, self.levels).astype(np.int64)
 
     def size(self, level: int) -> float:
-        """Side of a list's squares, metres; lists are counted from 0, the largest squares first."""
+        """Side of a list's squares, metres; level 0 is the list of the largest ones."""
         return self.smallest * 2.0 ** (self.levels - 1 - level)
 
 

@@ -71,9 +71,9 @@ class ScreenTable:
 
 @dataclass(frozen=True, eq=False)
 class DeviceLayers:
-    """A scene and its layered map on the device, as `project_forward` takes them for many pictures.
+    """A scene and its layered map on the device, for many pictures. Built by `upload_layers`.
 
-    Built by `upload_layers`; what it holds is for the methods alone.
+    Its fields `still`, `frame`, `layers`, `light`, `unshadowed`, `radiance` and `device` are for the methods alone.
     """
 
     still: DeviceStill
@@ -101,7 +101,7 @@ class ShadowPicture:
 
 
 def upload_layers(layered: LayeredMap, scene: StillScene, device: str | None = None) -> DeviceLayers:
-    """Brings a layered map and its scene to the device.
+    """Brings a layered map and its scene to a device: "cpu", "cuda:0", ...; None chooses as `Renderer` does.
 
     Raises:
         ValueError: the map is of another scene.
@@ -126,8 +126,16 @@ def upload_layers(layered: LayeredMap, scene: StillScene, device: str | None = N
 def project_forward(layers: DeviceLayers, camera: Camera, width: int, height: int) -> ShadowPicture:
     """Carries the map's points onto the screen, fills holes within surfaces, and smooths within surfaces.
 
-    `layers` is of `upload_layers`, `camera` any, `width` and `height` are pixels. Source: Jeng 2005, sections 4.3.1 to
-    4.3.3. Raises ValueError where the picture has no size, TypeError where `layers` or `camera` is something else.
+    Source: Jeng 2005, sections 4.3.1 to 4.3.3.
+
+    Args:
+        layers: of `upload_layers`.
+        camera: any, such as one of the scene's.
+        width, height: of the picture, pixels.
+
+    Raises:
+        ValueError: the picture has no size, or the camera has no pose or film.
+        TypeError: `layers` or `camera` is something else.
     """
     view, screen = _look(layers, camera, width, height)
     device, pixels = layers.device, screen.width * screen.height

@@ -1,19 +1,6 @@
 """The script shadow viewer: a file of light changes, played into frames (Jeng 2005, 3.5.2.2).
 
-A script is a JSON object:
-
-    {"cameras": ["front", "side"],
-     "lights": {"ceiling": {"position": [0, 0, 2.9], "target": [0, 0, 0], "width": 1.2, "height": 1.2,
-                            "rows": 15, "columns": 15}},
-     "steps": [{"frames": 1, "camera": "front", "ceiling": {"shape": "square", "side": 0.4, "radiance": [9, 8, 7]}},
-               {"frames": 24, "ceiling": {"at": [0.5, 0.0]}},
-               {"frames": 12, "camera": "side", "ceiling": {"on": false}}]}
-
-A light is a rectangle as of `rectangle_light`, cut into rows and columns of samples. A step lasts some frames and says
-what changes: the camera, and of a light whether it is `on`, its `radiance`, its `shape` (square, line, ring,
-letters) and what that shape takes (`side`, `at`, `angle`, `radius`, `width`, `text`). Numbers go evenly from what they
-were to what the step says, over its frames, so that lights move, grow and fade; all else changes with the step's first
-frame and stays.
+`read_script` says what such a file holds.
 """
 
 from __future__ import annotations
@@ -88,20 +75,25 @@ class SlabFrame:
 
 
 def read_script(path: str | Path) -> Script:
-    """Reads a script of changes of light: a JSON file, at most 10 MB, such as
+    """Reads a script of changes of light: a JSON file, at most 10 MB.
 
-        {"cameras": ["front", "side"],
-         "lights": {"lamp": {"position": [0, 0, 2], "target": [0, 0, 0], "width": 1.2, "height": 1.2,
-                             "rows": 15, "columns": 15}},
-         "steps": [{"camera": "front", "lamp": {"shape": "square", "side": 0.4, "radiance": [90, 80, 70]}},
-                   {"frames": 24, "lamp": {"at": [0.5, 0.0]}},
-                   {"frames": 12, "camera": "side", "lamp": {"on": false}}]}
+    ```json
+    {"cameras": ["front", "side"],
+     "lights": {"lamp": {"position": [0, 0, 2], "target": [0, 0, 0],
+                         "width": 1.2, "height": 1.2, "rows": 9, "columns": 9}},
+     "steps": [{"lamp": {"shape": "square", "side": 0.4, "radiance": [90, 80, 70]}},
+               {"frames": 24, "lamp": {"at": [0.5, 0.0]}},
+               {"frames": 12, "camera": "side", "lamp": {"on": false}}]}
+    ```
 
-    A light is a rectangle, as of `rectangle_light`, of rows x columns samples. A step lasts some frames, 1 unless it
-    says so, and says what changes: the camera, and of a light whether it is `on`, its `radiance`, its `shape` (square,
-    line, ring or letters) and what that shape takes (`side`, `at`, `angle`, `radius`, `width`, `text`; see
-    `templates`). Numbers go evenly from what they were to what the step says, over its frames; all else changes with
-    its first frame and stays. A light that no step has named is off.
+    A light is a rectangle, as of `warp_psf.rectangle_light`, of rows x columns samples. A step lasts some frames, one
+    unless it says otherwise, and tells what changes: the camera, and of a light whether it is `on`, its `radiance`, its
+    `shape` (square, line, ring or letters) and what that shape takes (`side`, `at`, `angle`, `radius`, `width`, `text`;
+    see `warp_psf.area_light.templates`). Numbers go evenly from what they were to what the step says, over its frames;
+    all else changes with its first frame and stays. A light is off until a step names it.
+
+    Args:
+        path: of the file.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -131,15 +123,17 @@ def play_script(
     size: int = 513,
     device: str | None = None,
 ) -> Iterator[SlabFrame]:
-    """The frames of a script, one after another; slabs and scene maps are baked before the first one.
+    """The frames of a script, one after another. Slabs and scene maps are baked, and errors raised, before the first.
 
     Each has `color`, `attenuation` and `shadowless`, linear, float32 [height, width, 3], as `SlabView.picture`,
     `SlabView.attenuation` and `SlabView.shadowless`, and `camera`, the place of its camera among the script's.
 
     ```python
-    script = psf.area_light.read_script("script.json")
+    A = psf.area_light
+    script = A.read_script("script.json")
     scene = psf.freeze_scene(model, data, cameras=script.cameras)
-    films = [frame.color for frame in psf.area_light.play_script(script, scene, width=160, height=120, size=65)]
+    frames = A.play_script(script, scene, width=160, height=120, size=65)
+    pictures = [frame.color for frame in frames]
     ```
 
     Args:

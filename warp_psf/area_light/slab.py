@@ -104,7 +104,7 @@ def make_light_plane(light: AreaLight, rows: int, columns: int) -> LightPlane:
     """The plane of a rectangular light, whose place it takes: row 0 is at its +y. Its radiance is of no matter.
 
     Args:
-        light: of `rectangle_light`, in the world.
+        light: of `warp_psf.rectangle_light`, in the world.
         rows, columns: of samples, 1 to 64.
 
     Raises:

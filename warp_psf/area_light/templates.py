@@ -1,7 +1,7 @@
 """Light templates: shapes that an area light may take on a plane of samples (Jeng 2005, 3.4.1 and figure 15).
 
 Each is float32 [rows, columns]: the share of each sample's cell that the shape covers, so that a shape can move by less
-than a cell and keep its light. Times a radiance it is what `SlabView` takes.
+than a cell and keep its light. Times a radiance it is what `warp_psf.area_light.SlabView` takes.
 """
 
 from __future__ import annotations

@@ -48,11 +48,23 @@ def bake_mesh(
 ) -> BakedBody:
     """Bakes a body's occlusion field and self-shadowed transfer, or reads them from the cache on disk.
 
-    order: SH bands, 2 to 6. threshold: of Tamura 2006, Equation 1; None keeps every sample. progress: called with the
-    finished share, 0 to 1. use_cache: False neither reads nor writes the cache.
+    A `Renderer` does this by itself. Boxes, rectangles and spheres have closed forms, and need nothing.
+
+    ```python
+    baked = psf.bake_mesh(psf.load_mesh("mesh.obj"), order=2)
+    size = baked.field.nbytes  # bytes
+    ```
+
+    Args:
+        mesh: the body's shape.
+        order: SH bands, 2 to 6.
+        threshold: of Tamura 2006, Equation 1, at least 0; None keeps every sample.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
+        progress: called with the finished share, 0 to 1.
+        use_cache: False neither reads nor writes the cache.
 
     Raises:
-        ValueError: the order or the threshold is out of range.
+        ValueError: the order or the threshold is out of range, or there is no such device.
     """
     check_settings(mesh, order, threshold)
     report = progress or (lambda share: None)

@@ -26,12 +26,13 @@ RESOLUTIONS = [2**k for k in range(FINEST_RESOLUTION.bit_length()) if 2**k >= CO
 
 @dataclass(frozen=True)
 class BakedBody:
-    """What is precomputed of a mesh.
+    """What is precomputed of a mesh. Built by `bake_mesh`.
 
-    field: its object occlusion field, or None where visibility has a closed form (boxes, rectangles, spheres).
-    transfer: self-visibility times cosine per vertex, on SH, float32 [vertices, coefficients], in the body's frame;
-        None for convex bodies, which do not shadow themselves.
-    visibility: self-visibility alone (zero below the horizon), likewise.
+    Attributes:
+        field: its object occlusion field, or None where visibility has a closed form (boxes, rectangles, spheres).
+        transfer: self-visibility times cosine per vertex, on SH, float32 [vertices, coefficients], in the body's frame;
+            None for convex bodies, which do not shadow themselves.
+        visibility: self-visibility alone (zero below the horizon), likewise.
     """
 
     field: ShadowField | None

@@ -169,7 +169,16 @@ def bake_silhouettes(
 ) -> SilhouetteField:
     """Bakes a body's silhouette field, or reads it from the cache on disk.
 
-    progress: called with the finished share, 0 to 1. use_cache: False neither reads nor writes the cache.
+    It holds how far each direction around the body lies within or outside of its outline, for `basis="haar"`.
+
+    Args:
+        mesh: the body's shape.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
+        progress: called with the finished share, 0 to 1.
+        use_cache: False neither reads nor writes the cache.
+
+    Raises:
+        ValueError: there is no such device.
     """
     report = progress or (lambda share: None)
     unit = unit_shape(mesh)

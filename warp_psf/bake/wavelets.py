@@ -197,9 +197,21 @@ def bake_wavelet_fields(
     shell_count: int = SHELL_COUNT,
     resolution: int = FINEST_RESOLUTION,
 ) -> list[WaveletField]:
-    """One field per threshold, from the same rays, otherwise as `bake_wavelet_field`.
+    """Bakes a body's all-frequency occlusion field, on Haar wavelets, for several thresholds from the same rays.
 
-    shell_count: at least FIRST_OUTER_SHELL + 1; resolution: samples per axis to begin with, a power of two.
+    For study: no renderer uses it. Boxes and spheres are baked, too. Nothing is cached. Source: Tamura 2006, section 6.
+
+    Args:
+        mesh: the body's shape.
+        thresholds: of Tamura 2006, Equation 1, one per field, at least 0; None keeps every sample.
+        device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
+        progress: called with the finished share, 0 to 1.
+        face_radiance: radiance that leaves the front of each face, float [faces]: bakes source radiance instead.
+        shell_count: at least FIRST_OUTER_SHELL + 1.
+        resolution: samples per axis to begin with, a power of two.
+
+    Raises:
+        ValueError: a threshold is negative or not a number, or there is no such device.
     """
     for threshold in thresholds:
         if threshold is not None and not threshold >= 0:

@@ -27,13 +27,15 @@ def freeze_scene(
     scene_option: mujoco.MjvOption | None = None,
     material_space: str = "srgb",
 ) -> StillScene:
-    """What MuJoCo would draw of a state, as triangles in the world, seen by cameras; for `area_light`.
+    """What MuJoCo would draw of a state, as triangles in the world, seen by cameras.
+
+    The methods of `warp_psf.area_light` take it.
 
     Skins and flexes come as they are bent now; sites and tendons, which cast no shadows, are left out. A texture counts
     with its mean.
 
     ```python
-    scene = psf.freeze_scene(model, data, cameras=["front", "side"])  # an area_light.StillScene
+    scene = psf.freeze_scene(model, data, cameras=["front", "side"])
     ```
 
     Args:
@@ -44,7 +46,7 @@ def freeze_scene(
         material_space: whether MJCF's rgba is "srgb" or "linear".
 
     Raises:
-        ValueError: there is no such camera, `data` is of another model, or nothing is drawn.
+        ValueError: there is no such camera, `data` is of another model, a name is unknown, or nothing is drawn.
         TypeError: an argument is something else.
     """
     option = mujoco.MjvOption() if scene_option is None else scene_option

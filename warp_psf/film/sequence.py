@@ -57,10 +57,8 @@ class FrameSequence:
 
     ```python
     settings = {"model": "model.xml", "bounces": 1}
-    with (
-        psf.Renderer(model, height=60, width=80, bounces=1) as renderer,
-        psf.FrameSequence("film", settings, frames=range(6), frames_per_second=24) as sequence,
-    ):
+    film = psf.FrameSequence("film", settings, frames=range(6), frames_per_second=24)
+    with film as sequence, psf.Renderer(model, 60, 80, bounces=1) as renderer:
         for index in sequence.frames:
             if sequence.missing(index):
                 renderer.update_scene(data, camera="front")
@@ -72,10 +70,10 @@ class FrameSequence:
 
     Every file is whole under its name or not there, so a run that was killed is continued by the same lines. Entering
     creates the folder, takes its lock and clears what a dead run left; leaving waits for the frames that were handed
-    over, also after an error or Ctrl-C. `folder` and `frames` can be read again.
+    over, also after an error or Ctrl-C. The attributes `folder` and `frames` are as given.
 
     Args:
-        folder: frames are frame_0000.exr and .png, beside film.mp4, contact_sheet.png and settings.json.
+        folder: its frames are frame_0000.exr and .png, beside film.mp4, contact_sheet.png and settings.json.
         settings: plain values (numbers, text, lists, None) that decide how a frame looks. They are kept in the folder,
             and a run with others is refused; the range of frames and the formats may change. `exposure` and `view`
             among them are used when the film is made from EXR frames.
@@ -146,7 +144,7 @@ class FrameSequence:
             self._raise_failure()
 
     def missing(self, index: int) -> bool:
-        """Whether the frame needs rendering: one of its files is not on the disk, or is empty.
+        """Whether frame `index` needs rendering: one of its files is not on the disk, or is empty.
 
         Raises:
             ValueError: the index is not of this sequence.

@@ -97,14 +97,17 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     """The layers of an EXR under the names that they were written by: float32, segmentation int32.
 
     ```python
-    with psf.FrameSequence("stills", {}, frames=range(1), frames_per_second=24, formats=("exr",)) as sequence:
-        sequence.write(0, {"color": np.ones((60, 80, 3), np.float32)}, np.zeros((60, 80, 3), np.uint8), None)
-    color = psf.read_exr("stills/frame_0000.exr")["color"]  # float32 [60, 80, 3]
+    with psf.Renderer(model, height=60, width=80, bounces=0) as renderer:
+        renderer.update_scene(data, camera="front")
+        film = psf.FrameSequence("one frame", {}, frames=range(1), frames_per_second=24)
+        with film as sequence:
+            sequence.write(0, renderer.layers(), renderer.render(), None)
+    depth = psf.read_exr("one frame/frame_0000.exr")["depth"]  # float32 [60, 80]
     ```
 
     Files of other programs are read too: R, G, B is `color`, a.R, a.G, a.B is `a`, Z is `depth`, and any other single
-    channel keeps its name. Layers of three are [height, width, 3], single ones [height, width]. Three were written as
-    half floats, so that they come back rounded to 11 bits.
+    channel keeps its name. Layers of three are [height, width, 3], single ones [height, width]. A `FrameSequence`
+    writes those of three as half floats: they come back rounded to 11 bits.
 
     Args:
         path: of the file.
@@ -240,8 +243,12 @@ def image_difference(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     """How far two arrays of one shape lie apart, in their own units: `rmse`, `maximum` and `mean_absolute`.
 
     ```python
-    shift = psf.image_difference(np.zeros((60, 80, 3)), np.full((60, 80, 3), 0.1))["rmse"]  # 0.1
+    black, grey = np.zeros((60, 80, 3)), np.full((60, 80, 3), 0.1)
+    rmse = psf.image_difference(black, grey)["rmse"]  # 0.1
     ```
+
+    Args:
+        a, b: arrays of one shape, both floats or both integers.
 
     Raises:
         ValueError: the shapes differ, there are no pixels, or one holds 8-bit values and the other linear floats.

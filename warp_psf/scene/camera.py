@@ -18,13 +18,14 @@ class Camera:
 
     The film's sizes are lengths at unit depth, that is, tangents; those of an orthographic camera are metres.
 
-    position: world position of the pinhole, or of the middle of an orthographic camera, metres, float64 [3].
-    rotation: world_from_camera rotation matrix, float64 [3, 3].
-    half_height: half the height of the film.
-    half_width: half its width; None takes the width at which pixels are square.
-    center: the film's middle (right, up), off the optical axis.
-    near, far: depths between which things are seen, metres along the optical axis.
-    orthographic: whether all rays are parallel to the optical axis.
+    Attributes:
+        position: world position of the pinhole, or of the middle of an orthographic camera, metres, float64 [3].
+        rotation: world_from_camera rotation matrix, float64 [3, 3].
+        half_height: half the height of the film.
+        half_width: half its width; None takes the width at which pixels are square.
+        center: the film's middle (right, up), off the optical axis.
+        near, far: depths between which things are seen, metres along the optical axis.
+        orthographic: whether all rays are parallel to the optical axis.
     """
 
     position: np.ndarray

@@ -70,8 +70,9 @@ class DeltaLight:
     A renderer shows the model's own lights by itself; these are for such that the model lacks.
 
     ```python
-    spot = psf.DeltaLight("spot", "spot", position=(0, 0, 3), direction=(0, 0, -1), diffuse=(0.8, 0.8, 0.8),
-                          specular=(0.3, 0.3, 0.3), ambient=(0, 0, 0), cutoff=np.radians(30), exponent=10, radius=0.02)
+    place = {"position": (0, 0, 3), "direction": (0, 0, -1)}
+    colors = {"diffuse": (1, 1, 0.9), "specular": (0.3, 0.3, 0.3), "ambient": (0, 0, 0)}
+    spot = psf.DeltaLight("spot", "spot", **place, **colors, cutoff=np.radians(30))
     ```
 
     The colours have MuJoCo's classic meaning: a white Lambert surface that faces the light has the colour `diffuse`.
@@ -152,7 +153,7 @@ def rectangle_light(
     """A flat rectangle that shines along its own +z, turned towards `target` or as `rotation` says.
 
     ```python
-    lamp = psf.rectangle_light("lamp", 1.0, 0.6, radiance=(8, 7, 6), position=(0, -1, 2), target=(0, 0, 0))
+    lamp = psf.rectangle_light("lamp", 1.0, 0.6, (8, 7, 6), (0, -1, 2), target=(0, 0, 0))
     ```
 
     Args:

@@ -19,16 +19,19 @@ FLAT_ANGLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class StillScene:
-    """Triangles in the world, grouped into surfaces. Built by `freeze_scene` and `make_still`; arrays are read-only.
+    """Triangles in the world, grouped into surfaces; arrays are read-only.
 
-    vertices: world positions, metres, float32 [V, 3].
-    normals: smooth unit normals, float32 [V, 3]; at creases a position has one vertex per side.
-    faces: vertex indices, counter-clockwise seen from outside, int32 [F, 3].
-    surface: which surface a face lies on, int32 [F]: faces that are joined without a crease. A cube has six surfaces, a
-        ball has one.
-    flat: whether a surface is a plane, bool [surfaces].
-    albedo: diffuse reflectance of a face, linear, float32 [F, 3]; of textures, their mean.
-    cameras: viewpoints.
+    Built by `warp_psf.freeze_scene` and `make_still`.
+
+    Attributes:
+        vertices: world positions, metres, float32 [V, 3].
+        normals: smooth unit normals, float32 [V, 3]; at creases a position has one vertex per side.
+        faces: vertex indices, counter-clockwise seen from outside, int32 [F, 3].
+        surface: which surface a face lies on, int32 [F]: faces that are joined without a crease. A cube has six
+            surfaces, a ball has one.
+        flat: whether a surface is a plane, bool [surfaces].
+        albedo: diffuse reflectance of a face, linear, float32 [F, 3]; of textures, their mean.
+        cameras: viewpoints.
     """
 
     vertices: np.ndarray
@@ -63,8 +66,18 @@ class Piece:
 def make_still(vertices, faces, albedo=(0.8, 0.8, 0.8), cameras: Sequence[Camera] = ()) -> StillScene:
     """A still scene of bare triangles.
 
-    vertices: world positions, metres, [V, 3]. faces: vertex indices, [F, 3]. albedo: linear, 3 numbers from 0 to 1.
-    cameras: viewpoints.
+    ```python
+    A = psf.area_light
+    mesh = psf.load_mesh("mesh.obj")
+    camera = A.Camera(np.array([0.0, 0.0, 4.0]), np.eye(3), half_height=0.4)
+    scene = A.make_still(mesh.vertices, mesh.faces, cameras=[camera])
+    ```
+
+    Args:
+        vertices: world positions, metres, [V, 3].
+        faces: vertex indices, [F, 3].
+        albedo: of all faces, linear, 3 numbers from 0 to 1.
+        cameras: a list of viewpoints.
 
     Raises:
         ValueError: an array has another shape, names a vertex that there is not, or holds what is no number.
