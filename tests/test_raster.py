@@ -1,4 +1,4 @@
-"""Drawn faces: each pixel's centre sees what a ray through it meets."""
+"""Drawn faces: each pixel's centre, and on edges its eight places, see what rays through them meet."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def seen(camera: str) -> dict[str, np.ndarray]:
     renderer.update_scene(data, camera)
     layers = renderer.layers()
     receivers = renderer._stage.surfaces.receivers
-    for name in ("entity", "position"):
+    for name in ("entity", "position", "weight"):
         layers[name] = getattr(receivers, name).numpy()[0, : HEIGHT * WIDTH]
     layers["drawn"] = renderer._stage.surfaces.raster.drawn.entity.numpy()[0] >= 0
     return layers
@@ -58,6 +58,11 @@ def test_drawing_and_rays_see_the_same(camera, monkeypatch):
     # Rays and planes agree to float32 at a distance of some metres.
     apart = np.linalg.norm(drawn["position"] - met["position"], axis=1)[same]
     assert np.quantile(apart, 0.999) < 1e-4
+    # Of edge pixels, the share of what the centre sees; one of eight places may fall to either side, too.
+    on_edge = same & (met["weight"] < 1.0)
+    assert on_edge.sum() > 500
+    assert (drawn["weight"] == met["weight"])[on_edge].mean() > 0.99
+    np.testing.assert_allclose(drawn["weight"][same], met["weight"][same], atol=0.251)
     np.testing.assert_allclose(
         drawn["depth"].ravel()[same][apart < 1e-4], met["depth"].ravel()[same][apart < 1e-4], rtol=1e-4
     )

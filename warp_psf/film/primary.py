@@ -1,7 +1,7 @@
 """Primary visibility: which surfaces each pixel sees, and with which shares.
 
 What every pixel's centre sees is drawn (`film/raster.py`), or met by a ray where it cannot be drawn. Where neighbouring
-pixels see different surfaces, or the centre meets a see-through one, rays look at eight places of the pixel, their
+pixels see different surfaces, or the centre meets a see-through one, eight places of the pixel are looked at so, their
 hits are grouped by surface, and each group becomes a receiver of its own with the group's share as its weight: edges
 are antialiased, what lies behind a pane is seen through it, and nothing is shaded twice.
 
@@ -27,7 +27,7 @@ from warp_psf.film.camera_rays import (
     tile_of,
     write_cameras,
 )
-from warp_psf.film.raster import DrawnTable, Raster, draw_faces, make_raster
+from warp_psf.film.raster import DrawnTable, Raster, draw_edges, draw_faces, make_raster, sample_offset
 from warp_psf.film.tracing import Hit, nothing_known, opacity_from_behind, sight_of_face, surface_of, trace
 from warp_psf.scene.camera import Camera
 from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables
@@ -60,21 +60,11 @@ class Surfaces:
     tiles: TileTable
     back: wp.array  # (entity) float32, how opaque it is from behind, as a share
     raster: Raster
-    none_known: wp.array  # (entity) int32, -1: for rays that meet everything themselves
 
     @property
     def slots(self) -> int:
         """Receiver slots per world."""
         return self.receivers.entity.shape[1]
-
-
-@wp.func
-def sample_offset(sample: int, samples: int) -> wp.vec2:
-    """Eight places in a pixel, one in each row and column of an 8 x 8 grid; of a single sample, the centre."""
-    if samples == 1:
-        return wp.vec2(0.5, 0.5)
-    column = (sample * 5 + 2) % 8
-    return wp.vec2((float(column) + 0.5) / 8.0, (float(sample) + 0.5) / 8.0)
 
 
 @wp.func
@@ -190,7 +180,8 @@ def _trace_edges(
     edge: wp.array2d(dtype=wp.int32),
     edge_rank: wp.array2d(dtype=wp.int32),
     edge_capacity: int,
-    none_known: wp.array(dtype=wp.int32),  # (entity): below zero
+    is_drawn: wp.array(dtype=wp.int32),  # (entity): below zero where it is not
+    drawn: DrawnTable,
     samples: int,
     receivers: ReceiverTable,
     extra_out: wp.array2d(dtype=wp.int32),
@@ -216,7 +207,12 @@ def _trace_edges(
             offset = sample_offset(sample, samples)
             origin = camera_origin(camera, world, x + offset[0], y + offset[1])
             ray = camera_ray(camera, world, x + offset[0], y + offset[1])
-            sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray, nothing_known(), none_known)
+            known = nothing_known()
+            entity = drawn.entity[world, samples * rank + sample]
+            if entity >= 0:
+                face = drawn.face[world, samples * rank + sample]
+                known = sight_of_face(geometry, poses, world, entity, face, origin, ray)
+            sight = trace(geometry, poses, camera, tiles, back, tile, world, origin, ray, known, is_drawn)
             behind = float(share)
             for place in range(sight.panes):
                 behind *= 1.0 - wp.abs(sight.pane_opacity[place])
@@ -268,8 +264,7 @@ def make_surfaces(
         camera=make_camera_table(worlds, width, height, device),
         tiles=make_tiles(worlds, width, height, len(scene.entities), device),
         back=wp.array(back, dtype=wp.float32, device=device),
-        raster=make_raster(worlds, width, height, scene, back, device),
-        none_known=wp.full(len(scene.entities), -1, dtype=wp.int32, device=device),
+        raster=make_raster(worlds, width, height, capacity * (SAMPLES if antialias else 1), scene, back, device),
     )
 
 
@@ -306,6 +301,7 @@ def find_surfaces(scene: DeviceScene, surfaces: Surfaces, device: wp.Device) -> 
     # What an earlier frame left there.
     receivers.entity[:, pixels:].fill_(-1)
     samples = SAMPLES if surfaces.antialias else 1
-    inputs = [*views, surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity, surfaces.none_known]
-    inputs += [samples, receivers]
+    edges = [surfaces.edge, surfaces.edge_rank, surfaces.edge_capacity]
+    draw_edges(surfaces.raster, *edges, samples, camera, tiles, device)
+    inputs = [*views, *edges, surfaces.raster.faces.first, surfaces.raster.drawn_edges, samples, receivers]
     launch(_trace_edges, dim, inputs, [surfaces.extra], device)

@@ -1,4 +1,5 @@
-"""Which faces of opaque bodies the pixels' centres see, found face by face and not ray by ray.
+"""Which faces of opaque bodies pixels see, at their centres and on edges at several places, face by face and not ray by
+ray.
 
 Every face is set up once in a frame: where it may be on the film, and as linear functions of the pixel its edges, which
 are positive outside, and its depth. A tile of the film then draws the faces of the bodies that reach into it, the
@@ -39,10 +40,12 @@ class FaceTable:
     face: wp.array(dtype=wp.int32)  # (face): of the entity's mesh
     first: wp.array(dtype=wp.int32)  # (entity): its first face, -1 for what rays are to meet
     count: wp.array(dtype=wp.int32)  # (entity)
-    shows: wp.array2d(dtype=wp.int32)  # (world, face): 1 where it may be on the film
+    shows: wp.array2d(dtype=wp.int32)  # (world, face): 1 where it may be on the film, be it between pixels' centres
     rank: wp.array2d(dtype=wp.int32)  # (world, face): how many show before it, over all worlds
     shown: wp.array(dtype=wp.int32)  # (place): those that show, in order
-    box: wp.array2d(dtype=wp.vec4i)  # (world, face): first and last column, first and last row
+    # (world, face): first and last column, first and last row of the pixels whose centres it may cover: of none, where
+    # the last comes before the first. Other places of a pixel it may cover up to a pixel further out.
+    box: wp.array2d(dtype=wp.vec4i)
     edge: wp.array3d(dtype=wp.vec3)  # (world, face, edge): positive outside
     slope: wp.array2d(dtype=wp.vec3)  # (world, face): the ray's advance through the face's plane per unit of depth
     offset: wp.array2d(dtype=wp.vec3)  # (world, face): from there to the plane; depth = offset / slope
@@ -50,7 +53,7 @@ class FaceTable:
 
 @wp.struct
 class DrawnTable:
-    """What the tiles have drawn, (world, pixel)."""
+    """What the tiles have drawn, (world, place): a pixel, or one of the places that are looked at on edges."""
 
     entity: wp.array2d(dtype=wp.int32)  # -1: nothing
     face: wp.array2d(dtype=wp.int32)
@@ -59,10 +62,11 @@ class DrawnTable:
 
 @dataclass(frozen=True)
 class Raster:
-    """The faces of a scene that are drawn, and room for a picture of them."""
+    """The faces of a scene that are drawn, and room for a picture of them, at centres and at the places on edges."""
 
     faces: FaceTable
     drawn: DrawnTable
+    drawn_edges: DrawnTable  # (world, SAMPLES * rank of the edge pixel + place)
 
 
 @wp.func
@@ -138,7 +142,7 @@ def _set_up_faces(first: int, geometry: GeometryTables, poses: PoseTables, camer
     right = wp.min(right, float(camera.width - 1))
     above = wp.max(above, 0.0)
     below = wp.min(below, float(camera.height - 1))
-    if left > right or above > below:
+    if left > right + 1.0 or above > below + 1.0:
         return
     faces.shows[world, item] = 1
     faces.box[world, item] = wp.vec4i(int(left), int(right), int(above), int(below))
@@ -208,8 +212,87 @@ def _draw_tiles(first: int, camera: CameraTable, tiles: TileTable, faces: FaceTa
                                     drawn.face[world, pixel] = faces.face[item]
 
 
-def make_raster(worlds: int, width: int, height: int, scene: Scene, back: np.ndarray, device: wp.Device) -> Raster:
-    """Room for what is drawn of a scene on a film of width x height pixels.
+@wp.func
+def sample_offset(sample: int, samples: int) -> wp.vec2:
+    """Eight places in a pixel, one in each row and column of an 8 x 8 grid; of a single sample, the centre."""
+    if samples == 1:
+        return wp.vec2(0.5, 0.5)
+    column = (sample * 5 + 2) % 8
+    return wp.vec2((float(column) + 0.5) / 8.0, (float(sample) + 0.5) / 8.0)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _draw_edges(
+    first: int,
+    camera: CameraTable,
+    tiles: TileTable,
+    faces: FaceTable,
+    edge: wp.array2d(dtype=wp.int32),  # (world, pixel): 1 on edges
+    edge_rank: wp.array2d(dtype=wp.int32),  # (world, pixel)
+    capacity: int,
+    samples: int,
+    drawn: DrawnTable,
+):
+    world, tile = wp.tid()
+    tile += first
+    left = (tile % tiles.columns) * wp.static(TILE)
+    above = (tile / tiles.columns) * wp.static(TILE)
+    right = wp.min(left + wp.static(TILE), camera.width) - 1
+    below = wp.min(above + wp.static(TILE), camera.height) - 1
+    edges = int(0)
+    for row in range(above, below + 1):
+        for column in range(left, right + 1):
+            pixel = row * camera.width + column
+            rank = edge_rank[world, pixel] - edge_rank[world, 0]
+            if edge[world, pixel] == 1 and rank < capacity:
+                edges += 1
+                for sample in range(samples):
+                    drawn.entity[world, samples * rank + sample] = -1
+                    drawn.depth[world, samples * rank + sample] = camera.far[world]
+    if edges == 0:
+        return
+    near = camera.near[world]
+    for place in range(tiles.count[world, tile]):
+        entity = tiles.entity[world, tile, place]
+        start = faces.first[entity]
+        if start >= 0:
+            last = start + faces.count[entity] - 1
+            behind = faces.rank[world, last] + faces.shows[world, last]
+            for number in range(faces.rank[world, start], behind):
+                item = faces.shown[number]
+                box = faces.box[world, item]
+                if box[0] <= right + 1 and box[1] >= left - 1 and box[2] <= below + 1 and box[3] >= above - 1:
+                    edge_0 = faces.edge[world, item, 0]
+                    edge_1 = faces.edge[world, item, 1]
+                    edge_2 = faces.edge[world, item, 2]
+                    slope = faces.slope[world, item]
+                    offset = faces.offset[world, item]
+                    for row in range(wp.max(above, box[2] - 1), wp.min(below, box[3] + 1) + 1):
+                        for column in range(wp.max(left, box[0] - 1), wp.min(right, box[1] + 1) + 1):
+                            pixel = row * camera.width + column
+                            rank = edge_rank[world, pixel] - edge_rank[world, 0]
+                            if edge[world, pixel] == 1 and rank < capacity:
+                                middle = wp.vec2(float(column - box[0]) - 0.5, float(row - box[2]) - 0.5)
+                                for sample in range(samples):
+                                    beside = middle + sample_offset(sample, samples)
+                                    at = wp.vec3(1.0, beside[0], beside[1])
+                                    if (
+                                        wp.dot(edge_0, at) <= 0.0
+                                        and wp.dot(edge_1, at) <= 0.0
+                                        and wp.dot(edge_2, at) <= 0.0
+                                    ):
+                                        depth = wp.dot(offset, at) / wp.dot(slope, at)
+                                        spot = samples * rank + sample
+                                        if depth >= near and depth < drawn.depth[world, spot]:
+                                            drawn.depth[world, spot] = depth
+                                            drawn.entity[world, spot] = entity
+                                            drawn.face[world, spot] = faces.face[item]
+
+
+def make_raster(
+    worlds: int, width: int, height: int, edge_places: int, scene: Scene, back: np.ndarray, device: wp.Device
+) -> Raster:
+    """Room for what is drawn of a scene on a film of width x height pixels, and at so many places on edges.
 
     back: how opaque each entity is from behind, as a share (see `opacity_from_behind`). What is see-through, or seen
     from behind, or has no lasting shape, is not drawn.
@@ -233,10 +316,14 @@ def make_raster(worlds: int, width: int, height: int, scene: Scene, back: np.nda
     faces.edge = wp.zeros((worlds, total, 3), dtype=wp.vec3, device=device)
     faces.slope = wp.zeros((worlds, total), dtype=wp.vec3, device=device)
     faces.offset = wp.zeros((worlds, total), dtype=wp.vec3, device=device)
+    return Raster(faces, *(_make_drawn((worlds, count), device) for count in (width * height, edge_places)))
+
+
+def _make_drawn(shape: tuple[int, int], device: wp.Device) -> DrawnTable:
     drawn = DrawnTable()
-    drawn.entity, drawn.face = (wp.zeros((worlds, width * height), dtype=wp.int32, device=device) for _ in range(2))
-    drawn.depth = wp.zeros((worlds, width * height), dtype=wp.float32, device=device)
-    return Raster(faces, drawn)
+    drawn.entity, drawn.face = (wp.zeros(shape, dtype=wp.int32, device=device) for _ in range(2))
+    drawn.depth = wp.zeros(shape, dtype=wp.float32, device=device)
+    return drawn
 
 
 def draw_faces(raster: Raster, scene: DeviceScene, camera: CameraTable, tiles: TileTable, device: wp.Device) -> None:
@@ -247,3 +334,21 @@ def draw_faces(raster: Raster, scene: DeviceScene, camera: CameraTable, tiles: T
         wp.utils.array_scan(faces.shows.flatten(), faces.rank.flatten(), inclusive=False)
     launch(_list_shown, faces.box.shape, [faces], [], device)
     launch(_draw_tiles, tiles.count.shape, [camera, tiles, faces, raster.drawn], [], device)
+
+
+def draw_edges(
+    raster: Raster,
+    edge: wp.array,
+    edge_rank: wp.array,
+    capacity: int,
+    samples: int,
+    camera: CameraTable,
+    tiles: TileTable,
+    device: wp.Device,
+) -> None:
+    """Draws the same at `samples` places of the first `capacity` edge pixels; after `draw_faces`.
+
+    edge: int32 (world, pixel), 1 on edges; edge_rank: how many come before, counted over all worlds.
+    """
+    inputs = [camera, tiles, raster.faces, edge, edge_rank, capacity, samples, raster.drawn_edges]
+    launch(_draw_edges, tiles.count.shape, inputs, [], device)
