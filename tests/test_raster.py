@@ -60,7 +60,7 @@ def test_drawing_and_rays_see_the_same(camera, monkeypatch):
     assert np.quantile(apart, 0.999) < 1e-4
     # Of edge pixels, the share of what the centre sees; one of eight places may fall to either side, too.
     on_edge = same & (met["weight"] < 1.0)
-    assert on_edge.sum() > 500
+    assert on_edge.sum() > 150
     assert (drawn["weight"] == met["weight"])[on_edge].mean() > 0.99
     np.testing.assert_allclose(drawn["weight"][same], met["weight"][same], atol=0.251)
     np.testing.assert_allclose(
