@@ -17,8 +17,8 @@ from warp_psf.shade.lattice import AWAKE, INTERPOLATED, STRIDES
 SPACINGS = (16, 8, 4, 2)
 # Probes are close enough when what a pixel between them receives differs by no more than this share of the brightest,
 # or by no more than this share of all light there.
-SMOOTH_INDIRECT = 0.15
-SMOOTH_ALL = 0.02
+SMOOTH_INDIRECT = 0.2
+SMOOTH_ALL = 0.03
 # ... and when what it receives of the sky differs by no more than this share of all light there.
 SMOOTH_SKY = 0.08
 # A pixel takes over a probe on the same body whose normal is near its own (cosines: full at the first, not at all at
