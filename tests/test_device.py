@@ -3,6 +3,7 @@
 import os
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -53,3 +54,24 @@ def test_a_forked_process_launches_on_threads_of_its_own():
 def test_a_renderer_leaves_gradients_of_other_kernels_alone():
     find_device("cpu")
     assert wp.config.enable_backward
+
+
+def test_threads_may_launch_a_kernel_that_none_has_loaded():
+    device = find_device("cpu")
+
+    def make_kernel(number: int):
+        @wp.kernel(enable_backward=False, module="unique")
+        def add(first: int, out: wp.array2d(dtype=wp.int32)):
+            world, item = wp.tid()
+            item += first
+            out[world, item] = out[world, item] + wp.static(number)
+
+        return add
+
+    for number in range(1, 9):
+        kernel = make_kernel(number)
+        outs = [wp.zeros((1, 4000), dtype=wp.int32, device=device) for _ in range(4)]
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda out, kernel=kernel: launch(kernel, (1, 4000), [], [out], device), outs))
+        for out in outs:
+            np.testing.assert_array_equal(out.numpy(), number)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from threading import Lock
 
 import warp as wp
 
@@ -16,6 +17,8 @@ import warp as wp
 PIECES_PER_CORE = 8
 # A piece smaller than this costs more to hand over (about 10 microseconds) than it saves.
 SMALLEST_PIECE = 64
+# Per module, held while it is loaded: where two threads load one, the code of the first goes away while it runs.
+_LOADING: dict[wp.Module, Lock] = {}
 
 
 def find_device(name: str | None = None) -> wp.Device:
@@ -48,25 +51,32 @@ def launch(kernel, dim: tuple[int, int], inputs: Sequence, outputs: Sequence, de
     if worlds == 0 or items == 0:
         return
     arguments = [0, *inputs, *outputs]
-    pieces = min(core_count() * PIECES_PER_CORE, max(1, items // SMALLEST_PIECE))
-    if device.is_cuda or pieces == 1:
+    if device.is_cuda:
         wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_tape=False)
         return
-    wp.load_module(kernel.module, device=device, block_dim=1)
+    pieces = min(core_count() * PIECES_PER_CORE, max(1, items // SMALLEST_PIECE))
     left = iter(range(pieces))
 
-    def launch_pieces() -> None:
+    def record() -> wp.Launch:
+        return wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_cmd=True)
+
+    def launch_pieces(command: wp.Launch | None = None) -> None:
         # The arguments are packed once for all pieces of a core.
-        command = wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_cmd=True)
+        command = command or record()
         for piece in left:
             first, end = items * piece // pieces, items * (piece + 1) // pieces
             command.set_dim((worlds, end - first))
             command.set_param_at_index(0, first)
             command.launch()
 
+    with _LOADING.setdefault(kernel.module, Lock()):
+        command = record()
+    if pieces == 1:
+        command.launch()
+        return
     others = [_workers().submit(launch_pieces) for _ in range(min(core_count(), pieces) - 1)]
     try:
-        launch_pieces()
+        launch_pieces(command)
     finally:
         # Who has not begun finds nothing left.
         begun = [other for other in others if not other.cancel()]

@@ -239,17 +239,20 @@ def _draw_edges(
     above = (tile / tiles.columns) * wp.static(TILE)
     right = wp.min(left + wp.static(TILE), camera.width) - 1
     below = wp.min(above + wp.static(TILE), camera.height) - 1
-    edges = int(0)
+    # A bit for each row and each column of the tile in which there are edges.
+    edge_rows = int(0)
+    edge_columns = int(0)
     for row in range(above, below + 1):
         for column in range(left, right + 1):
             pixel = row * camera.width + column
             rank = edge_rank[world, pixel] - edge_rank[world, 0]
             if edge[world, pixel] == 1 and rank < capacity:
-                edges += 1
+                edge_rows = edge_rows | (1 << (row - above))
+                edge_columns = edge_columns | (1 << (column - left))
                 for sample in range(samples):
                     drawn.entity[world, samples * rank + sample] = -1
                     drawn.depth[world, samples * rank + sample] = camera.far[world]
-    if edges == 0:
+    if edge_rows == 0:
         return
     near = camera.near[world]
     for place in range(tiles.count[world, tile]):
@@ -261,14 +264,23 @@ def _draw_edges(
             for number in range(faces.rank[world, start], behind):
                 item = faces.shown[number]
                 box = faces.box[world, item]
-                if box[0] <= right + 1 and box[1] >= left - 1 and box[2] <= below + 1 and box[3] >= above - 1:
+                first_column = wp.max(left, box[0] - 1)
+                last_column = wp.min(right, box[1] + 1)
+                first_row = wp.max(above, box[2] - 1)
+                last_row = wp.min(below, box[3] + 1)
+                near_edge = first_column <= last_column and first_row <= last_row
+                if near_edge:
+                    rows = (edge_rows >> (first_row - above)) & ((2 << (last_row - first_row)) - 1)
+                    columns = (edge_columns >> (first_column - left)) & ((2 << (last_column - first_column)) - 1)
+                    near_edge = rows != 0 and columns != 0
+                if near_edge:
                     edge_0 = faces.edge[world, item, 0]
                     edge_1 = faces.edge[world, item, 1]
                     edge_2 = faces.edge[world, item, 2]
                     slope = faces.slope[world, item]
                     offset = faces.offset[world, item]
-                    for row in range(wp.max(above, box[2] - 1), wp.min(below, box[3] + 1) + 1):
-                        for column in range(wp.max(left, box[0] - 1), wp.min(right, box[1] + 1) + 1):
+                    for row in range(first_row, last_row + 1):
+                        for column in range(first_column, last_column + 1):
                             pixel = row * camera.width + column
                             rank = edge_rank[world, pixel] - edge_rank[world, 0]
                             if edge[world, pixel] == 1 and rank < capacity:
