@@ -173,6 +173,17 @@ def test_progress_is_told():
     assert all(what.startswith("baking ") and 0 <= share <= 1 for what, share in told)
 
 
+def test_only_the_first_frame_tells_that_it_waits_for_kernels():
+    told = []
+    model, data = make_model(SCENE)
+    renderer = psf.Renderer(model, 4, 4, bounces=0, progress=lambda what, share: told.append((what, share)))
+    told.clear()
+    for _ in range(2):
+        renderer.update_scene(data)
+        renderer.render()
+    assert told == [("preparing kernels", 0.0), ("preparing kernels", 1.0)]
+
+
 def test_shapes_of_lights_are_not_baked_as_occluders(monkeypatch):
     monkeypatch.setattr(bake_body, "FINEST_RESOLUTION", 16)  # a fraction of the time to bake
     model, _ = make_model(SCENE)

@@ -84,7 +84,8 @@ class Renderer:
         model_lights: False leaves out the model's own lights and headlight.
         exposure, view: how `render` develops the picture: stops, and a view transform; see `to_display`.
         device: "cpu", "cuda:0", ...; None takes the first CUDA device, else the CPU.
-        progress: called as progress(what, share), a text and 0 to 1, while shapes are baked: once each, then cached.
+        progress: called as progress(what, share), a text and 0 to 1, while shapes are baked: once each, then cached;
+            and while the first frame waits for kernels, which are compiled once per machine.
 
     Raises:
         ValueError: a size, order, name or device is not usable; the message says which and what is.
@@ -386,7 +387,10 @@ class Renderer:
         if not self._drawn or self._scene.ngeom != self._drawn_geoms:
             stage = self._bring_loose(stage)
             place_deforming(stage, read_deformed(self._model, self._scene, self._bodies))
+            tell = (lambda what, share: None) if stage.seconds else self._progress  # of the first frame, which may wait
+            tell("preparing kernels", 0.0)
             draw(stage)
+            tell("preparing kernels", 1.0)
             self._drawn, self._drawn_geoms = True, self._scene.ngeom
         return stage
 
