@@ -17,6 +17,7 @@ from sims.bodies import knot, pin
 from warp_psf.bake import bake_radiance
 from warp_psf.basis import sh, sphere
 from warp_psf.field.shells import sample_directions, shell_radii
+from warp_psf.shade.proxies import MOST_PROXIES_PER_BODY
 
 ORDER = 4
 # The point whose light is followed, on the floor between the two bodies, metres.
@@ -263,15 +264,16 @@ def bounce_row(bodies: dict, environment: psf.Environment, height: int) -> list[
     """The knot's light as a sum of its functions, found at its proxies."""
     mesh, radiance = bodies["knot"]["mesh"], bodies["knot"]["radiance"]
     received = irradiance(bodies["knot"], bodies["pin"], environment)
-    weights = radiance.solver(len(radiance.proxies)) @ received[radiance.proxies]
+    chosen = radiance.proxies[:MOST_PROXIES_PER_BODY]
+    weights = radiance.solver(len(chosen)) @ received[chosen]
     rebuilt = radiance.basis @ weights
     top = np.percentile(received, 99)
     shapes = mesh.vertices, mesh.faces
-    proxies = radiance.proxies[mesh.normals[radiance.proxies][:, 2] > 0.2]
+    proxies = chosen[mesh.normals[chosen][:, 2] > 0.2]
     tiles = [
         Tile(
             draw_surface(*shapes, received / top, RISING[::-1], height, proxies),
-            ("Light is followed at", f"proxies, {len(radiance.proxies)} per body"),
+            ("Light is followed at", f"proxies, {len(chosen)} per body"),
             "arrow",
         )
     ]
