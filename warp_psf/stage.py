@@ -54,6 +54,7 @@ from warp_psf.shade.sharp import (
     write_leaves,
 )
 from warp_psf.shade.spheres import SphereState, carry_spheres, choose_cuts, make_cuts, upload_spheres
+from warp_psf.shade.texels import COARSE, FINE, refine_texels
 from warp_psf.shade.tint import tint_proxies
 
 Progress = Callable[[str, float], None]
@@ -351,18 +352,10 @@ def _bounce(stage: Stage, bounces: BounceState, last_gather: LastGather) -> None
         _light_proxies(stage, bounces)
     stage.has_moved = stage.is_lit_anew = False
     with _timed(stage, "last gather"):
-        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS, _pixel_size(stage))
+        size = (0.0, 0.0) if stage.seen is None else stage.seen[0].pixel_size(settings.width, settings.height)
+        seen = (stage.surfaces.receivers, stage.surfaces.extra, EXTRA_GROUPS, wp.vec2(*size))
         shown = (stage.cuts.pixels, stage.lattice, stage.received, stage.bounced)
         gather_last_bounce(last_gather, *seen, scene, *lights, *shown, device)
-
-
-def _pixel_size(stage: Stage) -> wp.vec2:
-    """How wide a pixel is at depth 0, metres, and how much wider it gets per metre."""
-    if stage.seen is None:
-        return wp.vec2(0.0, 0.0)
-    view, settings = stage.seen[0], stage.settings
-    size = 2.0 * view.half_sizes(settings.width, settings.height)[0] / settings.width
-    return wp.vec2(size, 0.0) if view.orthographic else wp.vec2(0.0, size)
 
 
 def _light_proxies(stage: Stage, bounces: BounceState) -> None:
@@ -371,10 +364,15 @@ def _light_proxies(stage: Stage, bounces: BounceState) -> None:
     with _timed(stage, "light on proxies"):
         cuts, received = stage.cuts.proxies, bounces.received
         choose_cuts(cuts, bounces.proxies, stage.spheres, device)
-        shade_direct(bounces.proxies, bounces.turns, 1, scene, *lights, cuts, *received, device)
+        whose = bounces.proxies, bounces.turns
+        for turn in (COARSE, FINE):
+            if turn == FINE:
+                refine_texels(bounces.patches, bounces.first_texel, *whose, *received, device)
+            shade_direct(*whose, turn, scene, *lights, cuts, *received, device)
+            if stage.sharp is not None:
+                add_sharp_light(*whose, turn, scene, *lights, stage.sharp, *received, device)
         shade_gloss(bounces.gloss, bounces.proxies, scene, *lights, cuts, stage.delta_lights, received[0], device)
         if stage.sharp is not None:
-            add_sharp_light(bounces.proxies, bounces.turns, 1, scene, *lights, stage.sharp, *received, device)
             gloss = bounces.gloss.table
             add_sharp_moments(bounces.proxies, gloss.proxy, scene, *lights, stage.sharp, gloss.moment, device)
         eye = stage.lighting.table.eye

@@ -332,7 +332,7 @@ class BounceState:
     own_rows: wp.array  # (own vertex): row of own_functions, which entities of one mesh share
     own_functions: wp.array
     own_light: wp.array  # vec3 (world, own vertex): irradiance there from the body itself
-    turns: wp.array  # int32 (world, proxy): 1, but 0 for proxies of glossy bodies, which `shade_moments` shades
+    turns: wp.array  # int32 (world, proxy): when it is lit, see `texels.py`
     tint: wp.array  # vec3 (world, proxy): what a texture multiplies its albedo with
     spacing: wp.array  # (body proxy): about how far apart a body's proxies lie, metres
     received: tuple[wp.array, wp.array]  # irradiance and Phong radiance of direct light

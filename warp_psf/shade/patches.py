@@ -18,11 +18,12 @@ from warp_psf.scene.scene import Scene
 from warp_psf.shade.occluders import OcclusionState
 
 # Texels along the longest side of a slab, and of all slabs together; the smallest slabs give some up first.
-MOST_TEXELS_PER_SIDE = 64
-MOST_TEXELS = 32768
+MOST_TEXELS_PER_SIDE = 128
+MOST_TEXELS = 65536
 # Direct light is followed at every texel, as shadows have edges; bounced light at one of each block of so many by so
-# many, as it has none.
+# many, as it has none. Along long sides blocks are larger: there are so many of them.
 BLOCK = 4
+BLOCKS_PER_SIDE = 16
 # However short a side is, it gets two texels: light falls off towards edges.
 FEWEST_TEXELS_PER_SIDE = 2
 # Bodies that rise above a face by less than this share of the slab's half-diagonal do not see it.
@@ -183,8 +184,8 @@ def block_of(texel: int, patches: PatchTables) -> wp.vec4i:
     face = patches[0].texel_face[texel]
     size = patches[0].size[face]
     start = patches[0].first_texel[face]
-    across = wp.min(wp.static(BLOCK), size[0])
-    down = wp.min(wp.static(BLOCK), size[1])
+    across = wp.min(wp.max(wp.static(BLOCK), size[0] / wp.static(BLOCKS_PER_SIDE)), size[0])
+    down = wp.min(wp.max(wp.static(BLOCK), size[1] / wp.static(BLOCKS_PER_SIDE)), size[1])
     left = (texel - start) % size[0] / across * across
     top = (texel - start) / size[0] / down * down
     return wp.vec4i(start + top * size[0] + left, size[0], across, down)
@@ -400,7 +401,7 @@ def build_pyramids(patches: Patches, radiance: wp.array, first_proxy: int, devic
 
 def _block_centers(size: np.ndarray) -> np.ndarray:
     """The middle texel of each block of a face."""
-    across, down = np.minimum(BLOCK, size)
+    across, down = np.minimum(np.maximum(BLOCK, size // BLOCKS_PER_SIDE), size)
     x, y = np.arange(across // 2, size[0], across), np.arange(down // 2, size[1], down)
     return (y[:, None] * size[0] + x).ravel()
 

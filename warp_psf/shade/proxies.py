@@ -18,6 +18,7 @@ from warp_psf.shade.occluders import OcclusionState
 from warp_psf.shade.patches import Patches, upload_patches
 from warp_psf.shade.relations import make_relations
 from warp_psf.shade.separable import factor_lobe
+from warp_psf.shade.texels import COARSE, GLOSSY, first_turns
 
 # A lobe that reflects no more than this is sent on evenly, as if it were Lambert: MuJoCo's default material's reflects
 # 0.055 of the light, too little for its shape to be seen on other bodies, and the terms double the cost of a bounce.
@@ -100,8 +101,8 @@ def upload_bounces(
     kept = _make_kept(kit, worlds, total, patches, len(chosen), sum(is_patch), device)
     glossy = [entity for entity in chosen if scene.entities[entity].lobe.specular.max() > LEAST_LOBE]
     gloss = _make_gloss(scene, glossy, kept, slots, starts, counts, field_of, fields, (order, functions), device)
-    turns = np.ones(slots, np.int32)
-    turns[gloss.table.proxy.numpy()] = 0
+    turns = np.concatenate([np.full(total, COARSE, np.int32), first_turns(patches)])
+    turns[gloss.table.proxy.numpy()] = GLOSSY
     proxies = make_receivers((worlds, slots), device)
     proxies.entity.fill_(-1)
     face = np.concatenate([np.zeros(0, np.int32), *faces, np.zeros(patches.texels, np.int32)])
