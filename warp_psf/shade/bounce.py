@@ -29,11 +29,11 @@ from warp_psf.shade.patches import (
     Patches,
     PatchTables,
     block_of,
-    build_pyramids,
     place_texels,
     slab_from_world,
     slab_origin,
 )
+from warp_psf.shade.pyramids import build_pyramids
 from warp_psf.shade.relations import RelationTable, hides_body, hides_face, relate
 
 

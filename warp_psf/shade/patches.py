@@ -28,9 +28,6 @@ BLOCKS_PER_SIDE = 16
 FEWEST_TEXELS_PER_SIDE = 2
 # Bodies that rise above a face by less than this share of the slab's half-diagonal do not see it.
 FACE_HORIZON = 1.0e-4
-# A texel counts as seen when this share of its hemisphere is open, less so below, and never for nothing.
-SEEN_OPENNESS = 0.25
-LEAST_SEEN = 0.01
 # A slab encloses the end of a face when it reaches to within this share of the other's half-diagonal of it.
 ENCLOSED = 1.0e-4
 # How far around a single body texels are fine, in its bounding radii: its shadow and what it lights lie within.
@@ -267,71 +264,6 @@ def _place_texels(first: int, poses: PoseTables, patches: PatchTables, first_pro
     proxies.normal[world, proxy] = to_world * n
 
 
-@wp.func
-def average_seen(a: wp.vec4, b: wp.vec4, c: wp.vec4, d: wp.vec4) -> wp.vec4:
-    """The mean of four texels, each counted as far as it is seen."""
-    seen = a[3] + b[3] + c[3] + d[3]
-    mean = (a[3] * a + b[3] * b + c[3] * c + d[3] * d) / wp.max(seen, 1.0e-9)
-    return wp.vec4(mean[0], mean[1], mean[2], 0.25 * seen)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def _build_pyramids(
-    first: int,
-    radiance: wp.array2d(dtype=wp.vec3),  # (world, proxy)
-    first_proxy: int,
-    patches: PatchTables,
-):
-    # What a body stands on is dark and hidden by that same body. Band-limited functions do not tell that sharply: they
-    # would see some of the dark below the body in place of the light beside it. So hidden texels take the light of
-    # their surroundings: up the pyramid as means of what is seen, down again into the places that are not.
-    world, face = wp.tid()
-    face += first
-    if patches[0].seen[world, face] == 0:
-        return
-    size = patches[0].size[face]
-    start = patches[0].first[face]
-    for index in range(size[0] * size[1]):
-        texel = patches[0].first_texel[face] + index
-        color = radiance[world, first_proxy + texel]
-        seen = wp.clamp(patches[0].openness[world, texel] / wp.static(SEEN_OPENNESS), wp.static(LEAST_SEEN), 1.0)
-        patches[0].radiance[world, start + index] = wp.vec4(color[0], color[1], color[2], seen)
-    levels = patches[0].levels[face]
-    for level in range(1, levels):
-        below = wp.vec2i(wp.max(size[0] >> (level - 1), 1), wp.max(size[1] >> (level - 1), 1))
-        width = wp.max(size[0] >> level, 1)
-        height = wp.max(size[1] >> level, 1)
-        # A side that has one texel left is no longer halved.
-        step_x = below[0] / width - 1
-        step_y = below[1] / height - 1
-        above = start + below[0] * below[1]
-        for index in range(width * height):
-            a = start + (index / width) * (1 + step_y) * below[0] + (index % width) * (1 + step_x)
-            b = a + step_y * below[0]
-            patches[0].radiance[world, above + index] = average_seen(
-                patches[0].radiance[world, a],
-                patches[0].radiance[world, a + step_x],
-                patches[0].radiance[world, b],
-                patches[0].radiance[world, b + step_x],
-            )
-        start = above
-    for turn in range(1, levels):
-        level = levels - 1 - turn
-        width = wp.max(size[0] >> level, 1)
-        height = wp.max(size[1] >> level, 1)
-        above = start
-        above_width = wp.max(size[0] >> (level + 1), 1)
-        above_height = wp.max(size[1] >> (level + 1), 1)
-        start = above - width * height
-        for index in range(width * height):
-            own = patches[0].radiance[world, start + index]
-            x = (index % width) * above_width / width
-            y = (index / width) * above_height / height
-            around = patches[0].radiance[world, above + y * above_width + x]
-            mixed = own[3] * own + (1.0 - own[3]) * around
-            patches[0].radiance[world, start + index] = wp.vec4(mixed[0], mixed[1], mixed[2], own[3])
-
-
 def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState, worlds: int, device: wp.Device):
     """The faces of those entities for which `is_patch` holds; all of them must be slabs."""
     occluders = occlusion.table.occluders
@@ -392,11 +324,6 @@ def place_texels(
     launch(_focus_faces, shape, [scene.geometry, scene.poses, patches.tables], [], device)
     inputs = [scene.poses, patches.tables, first_proxy, proxies]
     launch(_place_texels, (shape[0], patches.texels), inputs, [], device)
-
-
-def build_pyramids(patches: Patches, radiance: wp.array, first_proxy: int, device: wp.Device) -> None:
-    """Takes over the radiance of the proxies, vec3 (world, proxy), and filters it."""
-    launch(_build_pyramids, patches.table.focus.shape, [radiance, first_proxy, patches.tables], [], device)
 
 
 def _block_centers(size: np.ndarray) -> np.ndarray:
