@@ -56,7 +56,7 @@ class Camera:
         return wide, self.half_height
 
     def pixel_size(self, width: int, height: int) -> tuple[float, float]:
-        """How wide a pixel is in a picture of width x height at depth 0, metres, and how much wider it gets per metre."""
+        """How wide a pixel of a width x height picture is at depth 0, metres, and how much wider it gets per metre."""
         size = 2.0 * self.half_sizes(width, height)[0] / width
         return (size, 0.0) if self.orthographic else (0.0, size)
 
