@@ -6,11 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_psf.basis import sphere
 from warp_psf.device import upload_tables
 from warp_psf.scene.deforming import Deformed
 from warp_psf.scene.loose import Loose
 from warp_psf.scene.mesh import Mesh
 from warp_psf.scene.scene import Poses, Scene
+
+# In so many directions, spread evenly, the vertex of a mesh that reaches farthest is kept: how far a round body reaches
+# in any other direction is then known to one or two per cent.
+SPAN_DIRECTIONS = 128
 
 
 @wp.struct
@@ -28,6 +33,9 @@ class GeometryTable:
     radius: wp.array(dtype=wp.float32)  # (entity): of the bounding sphere, metres
     lower: wp.array(dtype=wp.vec3)  # (entity): corners of the bounding box, in the entity's frame
     upper: wp.array(dtype=wp.vec3)  # (entity)
+    first_outermost: wp.array(dtype=wp.int32)  # (entity): of its `outermost`
+    outermost_count: wp.array(dtype=wp.int32)  # (entity): 0 for those that change their shape
+    outermost: wp.array(dtype=wp.vec3)  # vertices that reach farthest in some direction, in the mesh's frame
     convex: wp.array(dtype=wp.bool)  # (entity)
     opacity: wp.array(dtype=wp.float32)  # (entity), in (0, 1]
     specular: wp.array(dtype=wp.vec3)  # (entity)
@@ -74,31 +82,27 @@ def find_placed(world: int, entity: int, geometry: GeometryTables, poses: PoseTa
     return placed
 
 
-@wp.struct
-class Extent:
-    """Where something lies in the world: in the box of three half axes around a centre."""
-
-    center: wp.vec3
-    axes: wp.mat33  # in columns
-
-
 @wp.func
-def extent_of(world: int, entity: int, geometry: GeometryTables, poses: PoseTables) -> Extent:
-    """An entity's bounding box: its sphere would reach below the floor on which it stands."""
+def span_of(world: int, entity: int, n: wp.vec3, geometry: GeometryTables, poses: PoseTables) -> wp.vec2:
+    """From where to where an entity reaches along a direction of the world, metres.
+
+    By its outermost vertices: its sphere, and its box when it is turned, would reach below the floor it stands on.
+    """
+    turned = wp.transpose(poses[0].rotation[world, entity]) * n
     lower = geometry[0].lower[entity]
     upper = geometry[0].upper[entity]
-    rotation = poses[0].rotation[world, entity]
-    extent = Extent()
-    extent.center = poses[0].position[world, entity] + rotation * (0.5 * (lower + upper))
-    extent.axes = rotation * wp.diag(0.5 * (upper - lower))
-    return extent
-
-
-@wp.func
-def reach_of(extent: Extent, n: wp.vec3) -> float:
-    """How far an extent reaches from its centre along a direction, metres."""
-    along = wp.transpose(extent.axes) * n
-    return wp.abs(along[0]) + wp.abs(along[1]) + wp.abs(along[2])
+    least = wp.dot(wp.min(wp.cw_mul(lower, turned), wp.cw_mul(upper, turned)), wp.vec3(1.0))
+    most = wp.dot(wp.max(wp.cw_mul(lower, turned), wp.cw_mul(upper, turned)), wp.vec3(1.0))
+    count = geometry[0].outermost_count[entity]
+    if count > 0:
+        least = float(1.0e30)
+        most = float(-1.0e30)
+    for place in range(count):
+        along = wp.dot(turned, geometry[0].outermost[geometry[0].first_outermost[entity] + place])
+        least = wp.min(least, along)
+        most = wp.max(most, along)
+    start = wp.dot(n, poses[0].position[world, entity])
+    return wp.vec2(start + least, start + most)
 
 
 @wp.func
@@ -160,6 +164,7 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     table.radius = per_entity([mesh.radius for mesh in shapes], wp.float32)
     table.lower = per_entity([wp.vec3(*map(float, mesh.vertices.min(axis=0))) for mesh in shapes], wp.vec3)
     table.upper = per_entity([wp.vec3(*map(float, mesh.vertices.max(axis=0))) for mesh in shapes], wp.vec3)
+    _upload_outermost(table, scene, device)
     table.convex = per_entity([mesh.convex for mesh in shapes], wp.bool)
     table.opacity = per_entity([entity.opacity for entity in scene.entities], wp.float32)
     table.specular = per_entity([wp.vec3(*map(float, lobe.specular)) for lobe in lobes], wp.vec3)
@@ -170,6 +175,19 @@ def upload_scene(scene: Scene, worlds: int, device: wp.Device) -> DeviceScene:
     poses.position = wp.zeros((worlds, len(scene.entities)), dtype=wp.vec3, device=device)
     poses.rotation = wp.zeros((worlds, len(scene.entities)), dtype=wp.mat33, device=device)
     return DeviceScene(upload_tables([table], GeometryTable, device), upload_tables([poses], PoseTable, device), meshes)
+
+
+def _upload_outermost(table: GeometryTable, scene: Scene, device: wp.Device) -> None:
+    """Fills the table's arrays over outermost vertices."""
+    directions = sphere.fibonacci_cap(SPAN_DIRECTIONS)
+    found = [mesh.vertices[np.unique((mesh.vertices @ directions.T).argmax(axis=0))] for mesh in scene.meshes]
+    starts = _starts(found)
+    lasting = [entity not in (*scene.deforming, scene.loose) for entity in range(len(scene.entities))]
+    meshes = [entity.mesh for entity in scene.entities]
+    counts = [len(found[mesh]) * kept for mesh, kept in zip(meshes, lasting, strict=True)]
+    table.first_outermost = wp.array([starts[mesh] for mesh in meshes], dtype=wp.int32, device=device)
+    table.outermost_count = wp.array(counts, dtype=wp.int32, device=device)
+    table.outermost = wp.array(_merged(found), dtype=wp.vec3, device=device)
 
 
 def _upload_parts(table: GeometryTable, scene: Scene, device: wp.Device) -> None:

@@ -84,13 +84,17 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
         sine = sources.sine
         ahead = sources.ahead
         open_to = values(1.0)
+        shut = float(0.0)
         covers = between.lists()
         gain = between.numbers()
         for place in range(sources.count):
             placed = find_placed(world, entity_at[place], geometry, poses)
             covered = kit.covered_by(world, entity_at[place], p, placed, o)
             covers[place] = weight[place] * covered
-            open_to = wp.cw_mul(open_to, values(1.0) - covers[place])
+            # Bodies hide together what they stand on; the walls of a room, which take up all of each other's view, do not.
+            flat = wp.where(patches[0].first_face[entity_at[place]] >= 0, 1.0, 0.0)
+            open_to = wp.cw_mul(open_to, values(1.0) - (1.0 - flat) * covers[place])
+            shut = wp.max(shut, flat * kit.sum_of_products(covers[place], transfer))
             gain[place] = between.horizon_gain(covered, surface.normal, lighting[0].weights[0], o[0].quadrature)
         count = int(0)
         faces = int(0)
@@ -142,7 +146,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                 kept.transport[world, station, faces] = weight[place] * wp.cw_mul(passed, transfer)
                 faces += 1
         if proxy >= first_texel:
-            openness = kit.sum_of_products(open_to, transfer) / wp.pi
+            openness = wp.min(kit.sum_of_products(open_to, transfer) / wp.pi, 1.0 - shut / wp.pi)
             block = block_of(proxy - first_texel, patches)
             for y in range(block[3]):
                 for x in range(block[2]):

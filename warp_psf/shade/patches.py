@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_psf.device import launch, upload_tables
-from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, extent_of, reach_of
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, span_of
 from warp_psf.scene.receiver import ReceiverTable
 from warp_psf.scene.scene import Scene
 from warp_psf.shade.occluders import OcclusionState
@@ -101,10 +101,9 @@ def slab_origin(world: int, entity: int, poses: PoseTables, patches: PatchTables
 def top_along(
     n: wp.vec3, world: int, entity: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables
 ) -> float:
-    """How far an entity's box reaches along a direction of the world, metres."""
+    """How far an entity reaches along a direction of the world, metres."""
     if patches[0].first_face[entity] < 0:
-        extent = extent_of(world, entity, geometry, poses)
-        return wp.dot(n, extent.center) + reach_of(extent, n)
+        return span_of(world, entity, n, geometry, poses)[1]
     n_slab = slab_from_world(world, entity, poses, patches) * n
     reach = wp.dot(wp.vec3(wp.abs(n_slab[0]), wp.abs(n_slab[1]), wp.abs(n_slab[2])), patches[0].slab_half[entity])
     return wp.dot(n, slab_origin(world, entity, poses, patches)) + reach

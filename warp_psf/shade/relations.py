@@ -7,7 +7,7 @@ looks at the receiver. Both are shares that change smoothly as the bodies move, 
 import warp as wp
 
 from warp_psf.device import launch
-from warp_psf.scene.geometry import DeviceScene, Extent, GeometryTables, PoseTables, extent_of, reach_of
+from warp_psf.scene.geometry import DeviceScene, GeometryTables, PoseTables, span_of
 from warp_psf.shade.patches import Patches, PatchTables, axis_vector, slab_from_world, slab_origin
 
 # The least half-extent over which a body passes through a plane, in units of its half-diagonal: a flat one is on one
@@ -25,26 +25,34 @@ class RelationTable:
 
 
 @wp.func
-def extent_of_face(world: int, face: int, poses: PoseTables, patches: PatchTables) -> Extent:
-    """The part of a face that sends out light."""
+def middle_of_face(world: int, face: int, poses: PoseTables, patches: PatchTables) -> wp.vec3:
+    """The middle of the part of a face that sends out light, in the world."""
     entity = patches[0].entity[face]
     axis = patches[0].axis[face]
     part = patches[0].part[world, face]
+    middle = part[0] * axis_vector((axis + 1) % 3) + part[2] * axis_vector((axis + 2) % 3)
+    middle += patches[0].side[face] * patches[0].half[face][2] * axis_vector(axis)
     to_world = wp.transpose(slab_from_world(world, entity, poses, patches))
-    u = axis_vector((axis + 1) % 3)
-    v = axis_vector((axis + 2) % 3)
-    middle = part[0] * u + part[2] * v + patches[0].side[face] * patches[0].half[face][2] * axis_vector(axis)
-    extent = Extent()
-    extent.center = slab_origin(world, entity, poses, patches) + to_world * middle
-    extent.axes = to_world * wp.diag(part[1] * u + part[3] * v)
-    return extent
+    return slab_origin(world, entity, poses, patches) + to_world * middle
 
 
 @wp.func
-def part_behind(extent: Extent, n: wp.vec3, height: float) -> float:
-    """The part of an extent behind a plane with normal n over which its centre stands at `height`, metres."""
-    size = wp.sqrt(wp.length_sq(extent.axes[0]) + wp.length_sq(extent.axes[1]) + wp.length_sq(extent.axes[2]))
-    return wp.clamp(0.5 - 0.5 * height / wp.max(reach_of(extent, n), wp.static(THINNEST) * size), 0.0, 1.0)
+def span_of_face(world: int, face: int, n: wp.vec3, poses: PoseTables, patches: PatchTables) -> wp.vec2:
+    """From where to where that part reaches along a direction of the world, metres."""
+    axis = patches[0].axis[face]
+    part = patches[0].part[world, face]
+    turned = slab_from_world(world, patches[0].entity[face], poses, patches) * n
+    reach = wp.abs(turned[(axis + 1) % 3]) * part[1] + wp.abs(turned[(axis + 2) % 3]) * part[3]
+    middle = wp.dot(n, middle_of_face(world, face, poses, patches))
+    return wp.vec2(middle - reach, middle + reach)
+
+
+@wp.func
+def part_behind(span: wp.vec2, height: float, thinnest: float) -> float:
+    """The part of a span below a height; one thinner than `thinnest` counts as so thick. All in metres."""
+    middle = 0.5 * (span[0] + span[1])
+    reach = wp.max(0.5 * (span[1] - span[0]), thinnest)
+    return wp.clamp(0.5 + 0.5 * (height - middle) / wp.max(reach, 1.0e-12), 0.0, 1.0)
 
 
 @wp.func
@@ -59,15 +67,21 @@ def _relate(first: int, geometry: GeometryTables, poses: PoseTables, patches: Pa
     world, source = wp.tid()
     source += first
     faces = patches[0].entity.shape[0]
-    extent = Extent()
+    size = float(0.0)
     if source < faces:
-        extent = extent_of_face(world, source, poses, patches)
+        sides = patches[0].part[world, source]
+        size = wp.length(wp.vec2(sides[1], sides[3]))
     else:
-        extent = extent_of(world, source - faces, geometry, poses)
+        size = geometry[0].radius[source - faces]
     for face in range(faces):
         n = normal_of(world, face, poses, patches)
-        middle = extent_of_face(world, face, poses, patches).center
-        part = part_behind(extent, n, wp.dot(n, extent.center - middle))
+        span = wp.vec2()
+        if source < faces:
+            span = span_of_face(world, source, n, poses, patches)
+        else:
+            span = span_of(world, source - faces, n, geometry, poses)
+        height = wp.dot(n, middle_of_face(world, face, poses, patches))
+        part = part_behind(span, height, wp.static(THINNEST) * size)
         relations.behind[world, source, face] = part
         if source >= faces:
             # What is half sunk into the face hides as much as its upper half does.
