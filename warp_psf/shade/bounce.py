@@ -28,13 +28,13 @@ from warp_psf.shade.occluders import OcclusionState
 from warp_psf.shade.patches import (
     Patches,
     PatchTables,
-    block_of,
     place_texels,
     slab_from_world,
     slab_origin,
 )
 from warp_psf.shade.pyramids import build_pyramids
 from warp_psf.shade.relations import RelationTable, hides_body, hides_face, relate
+from warp_psf.shade.stations import spread_light, spread_openness
 
 
 @cache
@@ -91,7 +91,7 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             placed = find_placed(world, entity_at[place], geometry, poses)
             covered = kit.covered_by(world, entity_at[place], p, placed, o)
             covers[place] = weight[place] * covered
-            # Bodies hide together what they stand on; the walls of a room, which take up all of each other's view, do not.
+            # Bodies together hide what they stand on. Walls take up all of each other's view, and hide nothing of it.
             flat = wp.where(patches[0].first_face[entity_at[place]] >= 0, 1.0, 0.0)
             open_to = wp.cw_mul(open_to, values(1.0) - (1.0 - flat) * covers[place])
             shut = wp.max(shut, flat * kit.sum_of_products(covers[place], transfer))
@@ -147,10 +147,8 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
                 faces += 1
         if proxy >= first_texel:
             openness = wp.min(kit.sum_of_products(open_to, transfer) / wp.pi, 1.0 - shut / wp.pi)
-            block = block_of(proxy - first_texel, patches)
-            for y in range(block[3]):
-                for x in range(block[2]):
-                    patches[0].openness[world, block[0] + y * block[1] + x] = openness
+            # The bodies' proxies are the first stations.
+            patches[0].station_openness[world, station - first_texel] = openness
         kept.count[world, station] = count
         kept.face_count[world, station] = faces
 
@@ -229,22 +227,15 @@ def make_bounce(order: int, functions: int) -> SimpleNamespace:
             irradiance += kit.light_of(world, own, bodies.own[proxy], bodies)
         plain = geometry[0].albedo[part_of(geometry, own, proxies.face[world, proxy])]
         irradiance = wp.max(irradiance, wp.vec3())
-        if proxy < first_texel:
-            albedo = wp.cw_mul(tint[world, proxy], plain)
-            radiance = wp.cw_mul(albedo + geometry[0].specular[own], irradiance) / wp.pi
-            if gloss.place[proxy] >= 0:
-                radiance = kit.leave_glossy(world, gloss.place[proxy], own, normal, irradiance, albedo, geometry, gloss)
-            radiance_out[world, proxy] = radiance
-            total_out[world, proxy] = total_out[world, proxy] + radiance
+        if proxy >= first_texel:
+            patches[0].gathered[world, station - first_texel] = irradiance
             return
-        block = block_of(proxy - first_texel, patches)
-        for y in range(block[3]):
-            for x in range(block[2]):
-                texel = first_texel + block[0] + y * block[1] + x
-                albedo = wp.cw_mul(tint[world, texel], plain)
-                radiance = wp.cw_mul(albedo + geometry[0].specular[own], irradiance) / wp.pi
-                radiance_out[world, texel] = radiance
-                total_out[world, texel] = total_out[world, texel] + radiance
+        albedo = wp.cw_mul(tint[world, proxy], plain)
+        radiance = wp.cw_mul(albedo + geometry[0].specular[own], irradiance) / wp.pi
+        if gloss.place[proxy] >= 0:
+            radiance = kit.leave_glossy(world, gloss.place[proxy], own, normal, irradiance, albedo, geometry, gloss)
+        radiance_out[world, proxy] = radiance
+        total_out[world, proxy] = total_out[world, proxy] + radiance
 
     @wp.kernel(enable_backward=False, module="unique")
     def solve_weights(
@@ -370,6 +361,7 @@ def gather_basis_irradiances(
     tables = [scene.geometry, scene.poses, occlusion.tables, lighting.tables, state.patches.tables, state.relations]
     inputs = [state.proxies, *tables, state.fields, state.bodies, state.gloss.table, threshold, state.first_texel]
     launch(kit.gather_basis, state.kept.count.shape, inputs, [state.kept], device)
+    spread_openness(state.patches, device)
 
 
 def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, times: int, device: wp.Device) -> None:
@@ -398,6 +390,7 @@ def bounce(state: BounceState, scene: DeviceScene, occlusion: OcclusionState, ti
         launch(kit.gather_moments, gloss.table.vector.shape, [*inputs, gloss.table], [], device)
         inputs += [state.tint, gloss.table, state.first_texel]
         launch(kit.bounce_light, state.kept.count.shape, inputs, outputs, device)
+        spread_light(patches, scene, state.tint, state.first_texel, *outputs, device)
     _represent(state, state.total, gloss.table.total, device)
     inputs = [state.bodies, state.own_entities, state.own_rows, state.own_functions]
     launch(kit.light_itself, state.own_light.shape, inputs, [state.own_light], device)

@@ -15,6 +15,9 @@ LOWEST_HEIGHT = 1.0e-4
 # The radiance is filtered over this share of the solid angle that a direction stands for: all of it would wash out
 # contact shadows, none would let single texels flicker through.
 SAMPLE_SHARE = 0.1
+# How far within the rim of a face its light is looked up at least, as the tangent of an angle. Band-limited, the face
+# reaches over its rim, and inside there is less than all of it: what counts there is the light of what lies within.
+RIM = 0.1
 
 
 @cache
@@ -115,14 +118,27 @@ def _radiance_snippet(points: int) -> str:
     """C++: where each direction meets the face, then what the pyramid holds there.
 
     Directions that do not meet the face's plane see none of it but for the ringing of its band-limited coverage, and
-    get the mean; one that passes by the face gets the nearest of the rim. From below the receiver's horizon nothing is
-    received but for the ringing of its band-limited cosine, which is to ring with the radiance above the horizon: such
-    directions are mirrored.
+    get the mean of the others; those that pass by the face, or meet it near its rim, get what lies `RIM` within. From
+    below the receiver's horizon nothing is received but for the ringing of its band-limited cosine, which is to ring
+    with the radiance above the horizon: such directions are mirrored.
     """
     half = points // 2
-    # Seen under the cosine c at the distance t a solid angle covers t^2 / c times as much of the face.
+    # From the height h, at the distance t, a solid angle covers t^3 / h times as much of the face.
     solid_angle = SAMPLE_SHARE * 4 * math.pi / points
     return f"""
+    // From where to where light is looked up along a side: its ends are turned inwards by an angle, as seen from a
+    // distance `away`, or meet in the middle of the angle between them.
+    const auto within = [](float low, float high, float at, float away, float& least, float& most) {{
+        const float tan_low = (low - at) / away, tan_high = (high - at) / away;
+        const float low_cut = 1.0f - tan_low * {RIM}f, high_cut = 1.0f + tan_high * {RIM}f;
+        least = at + away * (tan_low + {RIM}f) / low_cut;
+        most = at + away * (tan_high - {RIM}f) / high_cut;
+        if (low_cut <= 0.0f || high_cut <= 0.0f || least > most) {{
+            const float cos_low = 1.0f / ::sqrtf(1.0f + tan_low * tan_low);
+            const float cos_high = 1.0f / ::sqrtf(1.0f + tan_high * tan_high);
+            least = most = at + away * (tan_low * cos_low + tan_high * cos_high) / (cos_low + cos_high);
+        }}
+    }};
     const float low_u = -(half[0] + focus[0]) / (focus[1] + ::fabsf(half[0] + focus[0]));
     const float low_v = -(half[1] + focus[2]) / (focus[3] + ::fabsf(half[1] + focus[2]));
     const float scale_u = 1.0f / ((half[0] - focus[0]) / (focus[1] + ::fabsf(half[0] - focus[0])) - low_u);
@@ -132,6 +148,12 @@ def _radiance_snippet(points: int) -> str:
     const float nu = to_face.data[0][0] * n[0] + to_face.data[0][1] * n[1] + to_face.data[0][2] * n[2];
     const float nv = to_face.data[1][0] * n[0] + to_face.data[1][1] * n[1] + to_face.data[1][2] * n[2];
     const float nn = to_face.data[2][0] * n[0] + to_face.data[2][1] * n[1] + to_face.data[2][2] * n[2];
+    const float beyond_u = p[0] < 0.0f ? -p[0] - half[0] : p[0] - half[0];
+    const float beyond_v = p[1] < 0.0f ? -p[1] - half[1] : p[1] - half[1];
+    const float aside_u = beyond_u > 0.0f ? beyond_u : 0.0f, aside_v = beyond_v > 0.0f ? beyond_v : 0.0f;
+    float least_u, most_u, least_v, most_v;
+    within(-half[0], half[0], p[0], ::sqrtf(p[2] * p[2] + aside_v * aside_v), least_u, most_u);
+    within(-half[1], half[1], p[1], ::sqrtf(p[2] * p[2] + aside_u * aside_u), least_v, most_v);
     float place_u[{points}], place_v[{points}], level_at[{points}];
     for (int i = 0; i < {points}; ++i) {{
         const int j = i < {half} ? i : i - {half};
@@ -149,13 +171,14 @@ def _radiance_snippet(points: int) -> str:
         const float cosine = steep > 1.0e-3f ? steep : 1.0e-3f;
         const float t = p[2] / cosine;
         float u = p[0] + t * du, v = p[1] + t * dv;
-        u = u < -half[0] ? -half[0] : (u > half[0] ? half[0] : u);
-        v = v < -half[1] ? -half[1] : (v > half[1] ? half[1] : v);
+        u = u < least_u ? least_u : (u > most_u ? most_u : u);
+        v = v < least_v ? least_v : (v > most_v ? most_v : v);
+        const float squared = (u - p[0]) * (u - p[0]) + (v - p[1]) * (v - p[1]) + p[2] * p[2];
         const float off_u = u - focus[0], off_v = v - focus[2];
         const float near_u = 1.0f / (focus[1] + (off_u < 0.0f ? -off_u : off_u));
         const float near_v = 1.0f / (focus[3] + (off_v < 0.0f ? -off_v : off_v));
-        const float covered =
-            {solid_angle:.9e}f * t * t / cosine * texels_per_area * near_u * near_u * near_v * near_v;
+        const float squeezed = texels_per_area * near_u * near_u * near_v * near_v;
+        const float covered = {solid_angle:.9e}f * squared * ::sqrtf(squared) / p[2] * squeezed;
         place_u[i] = (off_u * near_u - low_u) * scale_u;
         place_v[i] = (off_v * near_v - low_v) * scale_v;
         // Half the binary logarithm of the texels covered, its fraction taken as linear.
@@ -169,13 +192,10 @@ def _radiance_snippet(points: int) -> str:
         const int width = size[0] >> (level - 1), height = size[1] >> (level - 1);
         starts[level] = starts[level - 1] + (width > 1 ? width : 1) * (height > 1 ? height : 1);
     }}
-    const auto& mean = texels.data[starts[levels - 1]];
     wp::vec_t<{3 * points}, float> all;
+    float mean[3] = {{0.0f, 0.0f, 0.0f}}, met = 0.0f;
     for (int i = 0; i < {points}; ++i) {{
-        if (level_at[i] < 0.0f) {{
-            for (int c = 0; c < 3; ++c) all[c * {points} + i] = mean[c];
-            continue;
-        }}
+        if (level_at[i] < 0.0f) continue;
         const float last = (float)(levels - 1), wanted = level_at[i] < last ? level_at[i] : last;
         const int fine = (int)wanted;
         const float share = wanted - (float)fine;
@@ -198,7 +218,12 @@ def _radiance_snippet(points: int) -> str:
                     + a * texel[top * width + right][c]) + b * ((1.0f - a) * texel[below * width + left][c]
                     + a * texel[below * width + right][c]));
         }}
-        for (int c = 0; c < 3; ++c) all[c * {points} + i] = sum[c];
+        for (int c = 0; c < 3; ++c) {{ all[c * {points} + i] = sum[c]; mean[c] += sum[c]; }}
+        met += 1.0f;
+    }}
+    for (int c = 0; c < 3; ++c) {{
+        const float rest = mean[c] / (met > 0.0f ? met : 1.0f);
+        for (int i = 0; i < {points}; ++i) if (level_at[i] < 0.0f) all[c * {points} + i] = rest;
     }}
     return all;
     """

@@ -32,8 +32,8 @@ FACE_HORIZON = 1.0e-4
 ENCLOSED = 1.0e-4
 # How far around a single body texels are fine, in its bounding radii: its shadow and what it lights lie within.
 SPREAD_PER_RADIUS = 3.0
-# Without bodies that draw texels to themselves they are spread evenly, as if drawn from this many half sides around.
-EVEN_SPREAD = 8.0
+# Something as weak as this draws them to so many half sides around: far from all bodies they are spread evenly.
+EVEN_PULL, EVEN_SPREAD = 0.02, 2.0
 
 
 @wp.struct
@@ -51,6 +51,7 @@ class PatchTable:
     half: wp.array(dtype=wp.vec3)  # (face): half extents along its own two axes, and of the slab across it, metres
     size: wp.array(dtype=wp.vec2i)  # (face): texels along its two axes, powers of two
     first_texel: wp.array(dtype=wp.int32)  # (face): among all faces' texels
+    first_station: wp.array(dtype=wp.int32)  # (face): among all faces' stations, row by row
     first: wp.array(dtype=wp.int32)  # (face): among all faces' pyramids, the finest level first
     levels: wp.array(dtype=wp.int32)  # (face): of its pyramid
     texel_face: wp.array(dtype=wp.int32)  # (texel)
@@ -60,8 +61,10 @@ class PatchTable:
     focus: wp.array2d(dtype=wp.vec4)
     seen: wp.array2d(dtype=wp.int32)  # (world, face): 1 when another body rises above it
     radiance: wp.array2d(dtype=wp.vec4)  # (world, place in a pyramid): three channels, and how far it is seen
-    # (world, texel): share of its hemisphere that no body takes up, as the sight of the texel is weighted
+    # (world, station), then (world, texel): share of its hemisphere that is open, as the sight of a texel is weighted
+    station_openness: wp.array2d(dtype=wp.float32)
     openness: wp.array2d(dtype=wp.float32)
+    gathered: wp.array2d(dtype=wp.vec3)  # (world, station): irradiance of a bounce
 
 
 PatchTables = wp.array(dtype=PatchTable)
@@ -174,19 +177,6 @@ def uncovered_part(world: int, face: int, geometry: GeometryTables, poses: PoseT
     )
 
 
-@wp.func
-def block_of(texel: int, patches: PatchTables) -> wp.vec4i:
-    """The block in which a texel lies: its first texel, the texels from one row to the next, and its own two sides."""
-    face = patches[0].texel_face[texel]
-    size = patches[0].size[face]
-    start = patches[0].first_texel[face]
-    across = wp.min(wp.max(wp.static(BLOCK), size[0] / wp.static(BLOCKS_PER_SIDE)), size[0])
-    down = wp.min(wp.max(wp.static(BLOCK), size[1] / wp.static(BLOCKS_PER_SIDE)), size[1])
-    left = (texel - start) % size[0] / across * across
-    top = (texel - start) / size[0] / down * down
-    return wp.vec4i(start + top * size[0] + left, size[0], across, down)
-
-
 @wp.kernel(enable_backward=False, module="unique")
 def _focus_faces(first: int, geometry: GeometryTables, poses: PoseTables, patches: PatchTables):
     world, face = wp.tid()
@@ -201,9 +191,10 @@ def _focus_faces(first: int, geometry: GeometryTables, poses: PoseTables, patche
     n_world = to_world * n
     part = uncovered_part(world, face, geometry, poses, patches)
     patches[0].part[world, face] = part
-    count = float(0.0)
+    count = float(wp.static(EVEN_PULL))
     mean = wp.vec2()
-    squares = wp.vec2()
+    evenly = wp.static(EVEN_SPREAD) * wp.vec2(part[1], part[3])
+    squares = count * wp.cw_mul(evenly, evenly)
     seen = int(0)
     for entity in range(patches[0].opacity.shape[0]):
         if patches[0].opacity[entity] > 0.0 and entity != own:
@@ -227,16 +218,13 @@ def _focus_faces(first: int, geometry: GeometryTables, poses: PoseTables, patche
                 squares += pull * wp.vec2(x * x + spread, y * y + spread)
     # The sides of a rectangle have no area, nor has what is enclosed.
     patches[0].seen[world, face] = wp.where(part[1] * part[3] > 0.0, seen, 0)
-    focus = wp.vec4(0.0, wp.static(EVEN_SPREAD) * part[1], 0.0, wp.static(EVEN_SPREAD) * part[3])
-    if count > 0.0:
-        mean = mean / count
-        focus = wp.vec4(
-            mean[0],
-            wp.sqrt(wp.max(squares[0] / count - mean[0] * mean[0], 1.0e-12)),
-            mean[1],
-            wp.sqrt(wp.max(squares[1] / count - mean[1] * mean[1], 1.0e-12)),
-        )
-    patches[0].focus[world, face] = focus
+    mean = mean / count
+    patches[0].focus[world, face] = wp.vec4(
+        mean[0],
+        wp.sqrt(wp.max(squares[0] / count - mean[0] * mean[0], 1.0e-12)),
+        mean[1],
+        wp.sqrt(wp.max(squares[1] / count - mean[1] * mean[1], 1.0e-12)),
+    )
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -307,6 +295,10 @@ def upload_patches(scene: Scene, is_patch: list[bool], occlusion: OcclusionState
     table.openness = wp.full((worlds, int(texels.sum())), 1.0, dtype=wp.float32, device=device)
     table.radiance = wp.zeros((worlds, sum(places)), dtype=wp.vec4, device=device)
     stations = [start + _block_centers(size) for start, size in zip(np.cumsum(texels) - texels, sizes, strict=True)]
+    counts = np.array([len(centers) for centers in stations], np.int64)
+    table.first_station = upload(np.cumsum(counts) - counts, wp.int32)
+    table.station_openness = wp.full((worlds, int(counts.sum())), 1.0, dtype=wp.float32, device=device)
+    table.gathered = wp.zeros((worlds, int(counts.sum())), dtype=wp.vec3, device=device)
     return Patches(
         table,
         upload_tables([table], PatchTable, device),

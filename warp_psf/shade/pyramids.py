@@ -11,7 +11,7 @@ from warp_psf.device import launch
 from warp_psf.shade.patches import Patches, PatchTables
 
 # A texel counts as seen when this share of its hemisphere is open, less so below, and never for nothing.
-SEEN_OPENNESS = 0.25
+SEEN_OPENNESS = 0.5
 LEAST_SEEN = 0.01
 
 
