@@ -13,8 +13,8 @@ from warp_psf.shade.patches import PatchTables
 # sink in a little, and from the plane itself a face is not seen.
 LOWEST_HEIGHT = 1.0e-4
 # The radiance is filtered over this share of the solid angle that a direction stands for: all of it would wash out
-# contact shadows, none would let single texels flicker through.
-SAMPLE_SHARE = 0.1
+# contact shadows, and with little of it, patches of shadow that a direction meets would show on walls as blotches.
+SAMPLE_SHARE = 0.4
 # How far within the rim of a face its light is looked up at least, as the tangent of an angle. Band-limited, the face
 # reaches over its rim, and inside there is less than all of it: what counts there is the light of what lies within.
 RIM = 0.1
