@@ -8,6 +8,7 @@ import warp as wp
 import warp_psf as psf
 from sims.bodies import statue_like
 from tests.oracles import make_renderer, polygon_form_factor
+from tests.oracles_bounce import traced_bounces
 from tests.oracles_sun import traced_sun
 from warp_psf.basis import sphere
 from warp_psf.shade.sharp import add_sharp_light
@@ -157,6 +158,21 @@ def test_a_plate_between_hides_a_lamp_from_what_is_right_below():
     outside = on_floor & (reach > 1.2)
     # Half a percent is interpolation's.
     np.testing.assert_allclose(irradiance[outside], bare[outside], rtol=6e-3)
+
+
+@pytest.mark.parametrize("turn", ["90 0 20", "60 0 20"])
+def test_a_lamp_s_shadow_is_that_of_rays_right_beside_what_casts_it(turn):
+    lamp = psf.rectangle_light("lamp", 0.6, 0.6, (9, 9, 9), (1.2, -0.8, 1.8), (0, 0, 0))
+    # It sinks into the floor a little, as contacts leave bodies.
+    body = f'<geom name="body" type="cylinder" size=".3 .3" pos="0 0 .29" material="white" euler="{turn}"/>'
+    irradiance, points, normals, names, renderer, data = picture(FLOOR + body, None, lights=[lamp])
+    beside = (names == "floor") & (np.linalg.norm(points - (0, 0, 0.29), axis=1) < 0.58)
+    light = {"lights": (lamp,), "bounces": 0, "paths": 1024}
+    expected = traced_bounces(renderer.model, data, points[beside], normals[beside], **light)[0]
+    error = (irradiance[beside] - expected)[:, 0] / expected.max()
+    assert beside.sum() > 50
+    # Rays of the reference leave noise of 0.01; pixels between those that are shaded are interpolated.
+    assert np.sqrt((error**2).mean()) < 0.018
 
 
 def test_a_lamp_above_a_ceiling_s_plane_is_hidden_by_nothing_behind_it():

@@ -12,8 +12,8 @@ import warp as wp
 from warp_psf.basis import sh, sphere
 from warp_psf.basis.visibility_mask import make_masks
 from warp_psf.field.rasterise import draw_all, make_horizon
-from warp_psf.field.silhouette_lanes import lanes, silhouette_distances
-from warp_psf.field.silhouettes import Silhouette, find_silhouette, silhouette_distance
+from warp_psf.field.silhouette_lanes import LANES, lanes, silhouette_distances
+from warp_psf.field.silhouettes import Silhouette, SilhouetteTables, find_silhouette, silhouette_distance
 from warp_psf.scene.geometry import GeometryTables, Placed, PoseTables, find_placed
 from warp_psf.shade.coverage import FIELD_SHAPE, SLAB_SHAPE, SPHERE_SHAPE
 from warp_psf.shade.delta import SHADOW_OFFSET, bulb_point
@@ -32,10 +32,14 @@ from warp_psf.shade.penumbra import (
 )
 from warp_psf.shade.sources import Group, SharpTables, Sources, direction_to
 
-# Nearer to a body's centre than this many bounding radii its surface may be so near that samples of its field are far
-# apart: edges are then known to this many radians, and where sources are few, rays find them.
+# Nearer to a body's centre than so many bounding radii its surface may be so near that samples of its field are far
+# apart: edges are then known to this many radians, and rays find them, where sources are few and none is a light.
 NEAR, NEAR_ERROR = 1.25, 0.1
 FEW_SOURCES = 4
+# For the pieces of a light rays count fully up to the first of these, in bounding radii, and up to the second less and
+# less. Where they shift an edge, it is bracketed to a piece, and the bracket is halved so many times.
+NEAR_LIGHT, NEXT_LIGHT = 1.4, 1.6
+HALVINGS = 2
 # Rays to a source; when the first few agree, the rest are left out.
 RAYS, FIRST_RAYS = 16, 4
 
@@ -57,6 +61,62 @@ def ray_share(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, radius: floa
             if wp.mesh_query_ray_anyhit(mesh, origin, wp.normalize(aimed), 4.0 * size):
                 hidden += 1
     return float(hidden) / float(cast)
+
+
+@wp.func
+def shift_by_rays(
+    mesh: wp.uint64,
+    origin: wp.vec3,
+    to_frame: wp.mat33,
+    sources: Sources,
+    distances: lanes,
+    size: float,
+    silhouettes: SilhouetteTables,
+    seen: Silhouette,
+) -> float:
+    """What is to be added to the distances of a light's pieces from a mesh's silhouette for rays to agree, radians.
+
+    Where a ray alone would decide which pieces are hidden, shadows would have as many steps as the light has pieces.
+    The shift lies between `least`, above which a piece is found hidden, and `most`, below which one is found visible;
+    the next ray goes to the piece that would tell most about zero. origin: in the mesh's frame; to_frame: from the
+    world into that; size: the radius of its bounding sphere.
+    """
+    least = float(-wp.static(NEAR_ERROR))
+    most = float(wp.static(NEAR_ERROR))
+    hidden = wp.vec3()
+    visible = wp.vec3()
+    pieces = int(wp.static(LANES))
+    for _ray in range(pieces):
+        aim = wp.clamp(0.0, least, most)
+        nearest = float(1.0e30)
+        next = int(-1)
+        for k in range(pieces):
+            shift = -distances[k]
+            if shift > least and shift < most and wp.abs(shift - aim) < nearest:
+                nearest = wp.abs(shift - aim)
+                next = k
+        if next < 0:
+            break
+        direction = direction_to(sources, next)
+        if wp.mesh_query_ray_anyhit(mesh, origin, to_frame * direction, 4.0 * size):
+            least = -distances[next]
+            hidden = direction
+        else:
+            most = -distances[next]
+            visible = direction
+    if wp.length_sq(hidden) > 0.0 and wp.length_sq(visible) > 0.0:
+        for _ray in range(wp.static(HALVINGS)):
+            if least > 0.0 or most < 0.0:
+                between = wp.normalize(hidden + visible)
+                shift = -silhouette_distance(silhouettes, seen, to_frame * between)
+                if shift > least and shift < most:
+                    if wp.mesh_query_ray_anyhit(mesh, origin, to_frame * between, 4.0 * size):
+                        least = shift
+                        hidden = between
+                    else:
+                        most = shift
+                        visible = between
+    return wp.clamp(0.0, least, most)
 
 
 @cache
@@ -137,17 +197,26 @@ def make_hiding(order: int) -> SimpleNamespace:
             seen = find_silhouette(s[0].silhouettes, s[0].field[entity], at)
         # What the distances may be off.
         error = float(0.0)
-        if shape == wp.static(FIELD_SHAPE) and group.count <= wp.static(FEW_SOURCES):
-            error = wp.where(wp.length(offset) < wp.static(NEAR) * placed.radius, wp.static(NEAR_ERROR), 0.0)
+        apart = wp.length(offset) / placed.radius
+        if shape == wp.static(FIELD_SHAPE) and (group.light >= 0 or group.count <= wp.static(FEW_SOURCES)):
+            near = wp.where(group.light >= 0, wp.static(NEXT_LIGHT), wp.static(NEAR))
+            error = wp.where(apart < near, wp.static(NEAR_ERROR), 0.0)
         # First the group as a whole, then each source.
         whole = distance_to(group.axis, shape, offset, placed.radius, to_frame, outline, seen, s)
         if whole <= -group.spread - error:
             return visible
         if whole >= group.spread + error:
             return (1.0 - weight) * visible
-        if shape == wp.static(FIELD_SHAPE) and group.light >= 0 and error == 0.0:
+        origin = to_frame * (p + (wp.static(SHADOW_OFFSET) * placed.radius) * n - placed.position)
+        mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
+        if shape == wp.static(FIELD_SHAPE) and group.light >= 0:
             # A light has pieces enough for what is thinner than it.
             distances = silhouette_distances(s[0].silhouettes, seen, to_frame, sources.toward)
+            if error > 0.0:
+                share = wp.clamp((wp.static(NEXT_LIGHT) - apart) * wp.static(1.0 / (NEXT_LIGHT - NEAR_LIGHT)), 0.0, 1.0)
+                silhouettes = s[0].silhouettes
+                shift = shift_by_rays(mesh, origin, to_frame, sources, distances, placed.radius, silhouettes, seen)
+                distances += lanes(share * shift)
             return wp.cw_mul(visible, lanes(1.0) - weight * disc_shares(distances, sources.radius))
         result = visible
         for k in range(group.count):
@@ -155,9 +224,6 @@ def make_hiding(order: int) -> SimpleNamespace:
             radius = sources.radius[k]
             covered = float(0.0)
             if error > 0.0:
-                origin = p + (wp.static(SHADOW_OFFSET) * placed.radius) * n
-                mesh = geometry[0].mesh_id[geometry[0].entity_mesh[entity]]
-                origin = wp.transpose(placed.rotation) * (origin - placed.position)
                 covered = ray_share(mesh, origin, to_frame * direction, radius, placed.radius)
             else:
                 distance = distance_to(direction, shape, offset, placed.radius, to_frame, outline, seen, s)
