@@ -105,6 +105,10 @@ def test_bad_environments(model, value, error, words):
     assert_refused(lambda: psf.Renderer(model, 4, 4, environment=value), error, *words)
 
 
+def test_environment_on_no_bands():
+    assert_refused(lambda: psf.load_environment("studio").project(0), ValueError, "0 bands", "at least 1")
+
+
 # Models, meshes, lights, data, cameras
 
 

@@ -342,6 +342,8 @@ def test_cameras_that_are_not_there(model, data):
     for camera in ("aye", 1, -2):
         with pytest.raises(ValueError, match="does not exist; the model has eye, and -1 is the free camera"):
             bridge.read_camera(model, data, camera)
+    with pytest.raises(TypeError, match="neither an id nor a name nor an MjvCamera; the model has eye"):
+        bridge.read_camera(model, data, 0.5)
     with pytest.raises(ValueError, match="the model has only -1"):
         bridge.read_camera(*simple(), "eye")
     user, tracking, fixed = mujoco.MjvCamera(), mujoco.MjvCamera(), mujoco.MjvCamera()

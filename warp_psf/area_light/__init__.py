@@ -7,7 +7,7 @@ is seen by cameras (`Camera`).
 The shadow slab, for lights that move and change their shape under a camera that stands still. A rectangle of light
 samples has a shadow map each, what the camera sees is a scene map, and a change of the light asks only the samples that
 changed: `make_light_plane`, `LightPlane`, `bake_shadow_slab`, `ShadowSlab`, `bake_scene_map`, `SceneMap`, `SlabView`,
-`templates`. A file of such changes is played into frames: `read_script`, `Script`, `play_script`.
+`templates`. A file of such changes is played into frames: `read_script`, `Script`, `Step`, `play_script`, `SlabFrame`.
 
 ```python
 A = psf.area_light
@@ -51,7 +51,7 @@ from warp_psf.area_light.projection import (
     upload_layers,
 )
 from warp_psf.area_light.scene_map import SceneMap, bake_scene_map
-from warp_psf.area_light.script import Script, play_script, read_script
+from warp_psf.area_light.script import Script, SlabFrame, Step, play_script, read_script
 from warp_psf.area_light.slab import LightPlane, ShadowSlab, bake_shadow_slab, make_light_plane
 from warp_psf.area_light.splatting import DevicePoints, PointPicture, splat_points, upload_points
 from warp_psf.scene.camera import Camera
@@ -69,7 +69,9 @@ __all__ = [
     "Script",
     "ShadowPicture",
     "ShadowSlab",
+    "SlabFrame",
     "SlabView",
+    "Step",
     "StillScene",
     "bake_layered_map",
     "bake_scene_map",

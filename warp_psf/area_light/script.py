@@ -31,7 +31,13 @@ DARK: dict[str, Any] = {"on": True, "shape": "square", "radiance": (1.0, 1.0, 1.
 
 @dataclass(frozen=True)
 class Step:
-    """What changes over some frames. lights: for each light named, what it becomes."""
+    """What changes over some frames.
+
+    Attributes:
+        frames: over how many.
+        camera: the viewpoint from then on; None leaves the one before.
+        lights: for each light named, what it becomes.
+    """
 
     frames: int
     camera: str | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from typing import SupportsIndex
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ def read_camera(model: mujoco.MjModel, data: mujoco.MjData, camera: int | str | 
 
     Raises:
         ValueError: there is no such camera, or `data` is of another model.
+        TypeError: `camera` is none of these.
     """
     check_data(model, data)
     chosen = find_camera(model, camera)
@@ -52,6 +54,8 @@ def find_camera(model: mujoco.MjModel, camera: int | str | mujoco.MjvCamera) -> 
         chosen = mujoco.MjvCamera()
         mujoco.mjv_defaultFreeCamera(model, chosen)
         named = isinstance(camera, str)
+        if not named and not isinstance(camera, SupportsIndex):
+            raise TypeError(f"camera {camera!r} is neither an id nor a name nor an MjvCamera; {_known_cameras(model)}")
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera) if named else operator.index(camera)
         if named or index != -1:
             chosen.type, chosen.fixedcamid = kinds.mjCAMERA_FIXED, index

@@ -87,7 +87,12 @@ class Environment:
 
         A cell has one radiance all over its solid angle. The integral over azimuth is exact; that over the polar angle
         is Gauss-Legendre's. Band-limited light is padded with zeros or truncated.
+
+        Raises:
+            ValueError: `order` is below 1.
         """
+        if order < 1:
+            raise ValueError(f"cannot project an environment onto {order} bands; choose at least 1")
         if self.coefficients is not None:
             kept = self.coefficients[: order * order]
             return np.concatenate((kept, np.zeros((order * order - len(kept), 3))))

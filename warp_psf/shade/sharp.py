@@ -216,7 +216,7 @@ def make_sharp(order: int) -> SimpleNamespace:
                     mirrored_sent += lobe * sources.solid_angle[k]
                     mirrored_arrived += lobe * share * sources.solid_angle[k]
                     toward += (weight * share) * direction
-        if group.light >= 0 and sent > 0.0:
+        if group.light >= 0 and arrived > 0.0:
             entity = s[0].light_entity[group.light]
             placed = find_placed(world, entity, geometry, poses)
             light = s[0].light_radiance[world, group.light]
